@@ -34,9 +34,8 @@ from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
 from .prediction.predict import CurvePrediction as CurvePrediction
 from .prediction.predict import predict as predict
-from .results.stored import NoResults as NoResults
-from .results.stored import StoredFit as StoredFit
-from .results.stored import read_results as read_results
+from .results.read import NoResults as NoResults
+from .results.read import read_results as read_results
 from .scene.assemble import make_scene as make_scene
 from .scene.assemble import with_geometry as with_geometry
 from .scene.declare import PlanError as PlanError

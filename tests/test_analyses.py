@@ -2,13 +2,16 @@
 
 import csv
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
+import numpy as np
 import pytest
 from run_cli import GOOD, run
 
 from jaxtrachea.cli.main import app
 from jaxtrachea.config import SpecError, UncertaintySection
+from jaxtrachea.files.table import Table
 from jaxtrachea.inference import analyses
 from jaxtrachea.inference.analysis import Analysis, Unavailable
 
@@ -23,27 +26,35 @@ def draw():
     return figure
 
 
-def datasets(group, found):
-    group["twice"] = 2 * found
-
-
 def refuse(request):
     raise SpecError("--toy: not today")
+
+
+class Played(NamedTuple):
+    """What is found."""
+
+    lanes: int
+
+    @property
+    def twice(self):
+        return np.array([2 * self.lanes])
 
 
 #: Finds the number of lanes, and says it in every way there is.
 TOY = Analysis(
     name="toy",
-    compute=lambda request, findings, progress: findings.result.lanes,
+    compute=lambda request, findings, progress: Played(findings.result.lanes),
     work="playing",
     asked=lambda request: True,
-    tables=lambda found: {"toy.csv": [{"lanes": found}]},
+    tables=lambda found: {"toy.csv": Table([{"lanes": found.lanes}])},
     lane_cells=lambda found, lane: {"played": lane + 100},
     parameter_cells=lambda found, lane, i: {"toy": 10 * lane + i},
-    datasets=datasets,
-    section=lambda found: ["## Toys", f"{found} lanes were played with."],
+    datasets=("twice",),
+    attributes=("lanes",),
+    table=lambda found, lanes: Table([{"played": found.lanes}], title="Toys"),
+    section=lambda found: [f"{found.lanes} lanes were played with."],
     warning=lambda found: ["Toys are **no** tools."],
-    shown=lambda found, lanes: [f"{found} toys"],
+    shown=lambda found: [f"{found.lanes} toys"],
     figures=lambda found: {"toy.png": draw},
     poor=lambda found: True,
 )
@@ -76,7 +87,9 @@ def test_one_record_is_all_that_a_new_analysis_takes(command):
     assert Path("out/toy.png").read_bytes()[:4] == b"\x89PNG"
     with h5py.File("out/results.h5") as file:
         lanes = len(file["lanes/status"])
-        assert file["toy/twice"][()] == 2 * lanes
+        assert file["toy/twice"][()].tolist() == [2 * lanes]
+        assert file["toy"].attrs["lanes"] == lanes
+    assert f"## Toys\n\n| played |\n| --- |\n| {lanes} |\n\n{lanes} lanes" in text
     with Path("out/parameters.csv").open(newline="") as stream:
         cells = [row["toy"] for row in csv.DictReader(stream)]
     assert cells == [str(10 * lane + i) for lane in range(lanes) for i in range(2)]
@@ -117,7 +130,7 @@ def test_an_analysis_is_done_only_if_asked_for_and_sees_those_before_it(command)
     )  # fmt: skip
     command(never, TOY, after, elsewhere)
     assert len(seen) == 1
-    assert isinstance(seen[0], int)
+    assert isinstance(seen[0], Played)
 
 
 def test_each_analysis_follows_the_one_that_it_names():

@@ -5,11 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
+from jaxtrachea.fitting.evaluate import evaluated
 from jaxtrachea.fitting.force_share import Levels, _most_likely, changed, with_levels
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.results.arrays import arrays_of, result_of
+from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.results.read import read_results
+from jaxtrachea.runs.shards import join
 from jaxtrachea.trachea.geometry import table_1
 
 F = np.tile(np.linspace(0, 3, 60), 5)
@@ -41,11 +47,11 @@ def test_even_noise_has_no_share():
     assert np.mean(np.array(shares) > 0) < 0.01
 
 
-def study(noise, depth=6.0, options=Options()):
+def study(noise, depth=6.0, options=Options(), parameters=None):
     D = np.linspace(0, depth, 20)
     curves = [Curve("A", f"{s}", s_c=s, phi_c=0.0, displacement=D, force=0.5 * D)
               for s in (40.0, 75.0)]  # fmt: skip
-    return build_study(curves, table_1(), options, noise=noise)
+    return build_study(curves, table_1(), options, parameters, noise=noise)
 
 
 def test_deep_presses_ask_for_a_share():
@@ -83,3 +89,21 @@ def test_lanes_without_a_share_are_left_alone():
     assert changed(None, Levels(sigma, some)).tolist() == [1]
     assert changed(Levels(sigma, some), Levels(sigma * [3, 1.001], some)).tolist() == []
     assert changed(Levels(sigma, none), Levels(2 * sigma, some)).tolist() == [1]
+
+
+def test_a_share_that_was_found_is_kept_with_the_fit(tmp_path):
+    """In the arrays of a shard and in results.h5; once it was lost in both, with its weights."""
+    held = {"k_1": {"fixed": True, "value": 0.5}}
+    plain = study(Noise(), parameters={n: held["k_1"] for n in ("k_1", "k_3", "EI_L", "k_M")})
+    weighed = with_levels(plain, Levels(np.array([0.02]), np.array([0.05])), plain.lanes.force)
+    result = evaluated(weighed)
+    write_hdf5(tmp_path / "results.h5", Findings(result), {})
+    for back in (result_of(plain, arrays_of(result)), read_results(tmp_path)):
+        assert back.force_share.tolist() == [0.05]
+        np.testing.assert_array_equal(back.study.lanes.precision, weighed.lanes.precision)
+        np.testing.assert_array_equal(back.study.shares.plain, plain.lanes.precision)
+    none = evaluated(plain)
+    both = join(plain.take(np.array([0, 0])), [none, result])
+    assert both.force_share.tolist() == [0, 0.05]
+    np.testing.assert_array_equal(both.study.lanes.precision[0], plain.lanes.precision[0])
+    assert result_of(plain, arrays_of(none)).study.force_share is None  # no refit looks again

@@ -114,10 +114,10 @@ WITHIN = {
         {"analyses"},
     ],
     "inference/design": [{"press", "candidates"}, {"situation"}, {"choice"}, {"identifiability"}],
-    "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
+    "results": [{"arrays", "store"}, {"rows", "hdf5"}, {"read"}],
     "trials": [{"polynomials", "uneven_noise"}, {"differences"}, {"repeats"}],
-    "prediction": [{"core", "model_error", "sources"}, {"predict"}, {"held_out"},
-                   {"plots", "report", "tables"}],
+    "prediction": [{"core", "pressed"}, {"model_error", "sources"}, {"predict"}, {"held_out"},
+                   {"plots", "tables"}, {"report"}],
     "runs": [{"manifest"}, {"shards"}, {"folder"}, {"rerun", "checkpoint"}, {"cluster"}],
     "tradeoff": [
         {"calls", "errors", "front", "levels", "load"},

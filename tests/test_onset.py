@@ -29,8 +29,9 @@ from jaxtrachea.measurements.first_touch import first_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, compliance
 from jaxtrachea.prediction.held_out import compare
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.results.hdf5 import write_hdf5
-from jaxtrachea.results.stored import read_results
+from jaxtrachea.results.read import read_results
 from jaxtrachea.trachea.material import Material
 
 ONE = Settings(starts=1, scrutiny=False)
@@ -355,7 +356,7 @@ def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path
     force = k_1 * np.maximum(D - 4, 0) + k_3 * np.maximum(D - 4, 0) ** 3 + 0.2
     force = force + 0.05 * np.random.default_rng(3).normal(size=80)
     deep = Curve("s0", "deep", 20.0, 0.0, D, force)
-    *used, found = compare(read, [*read.curves, deep])
+    *used, found = compare(read, [*pressed(read).curves, deep])
     seen = predictions(owned.study, owned.theta).force.reshape(8, 80)
     assert {c.in_fit for c in used} == {"yes"}
     np.testing.assert_allclose([c.residual for c in used], seen, rtol=0, atol=1e-9)

@@ -13,12 +13,13 @@ import jaxtrachea
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.model import columns_of
 from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import Source
-from jaxtrachea.results import stored
-from jaxtrachea.results.hdf5 import read_hdf5
+from jaxtrachea.results.read import NoResults, read_again
 from jaxtrachea.status import FitStatus, PredictionStatus
 
 
@@ -39,6 +40,12 @@ def stiffness(read, lane):
     return [p.from_scaled(v) for p, v in pairs]
 
 
+def without_covariance(read):
+    """The same fit, sure of what it keeps."""
+    local = read.uncertainty._replace(covariance=np.zeros_like(read.uncertainty.covariance))
+    return dataclasses.replace(read, uncertainty=local)
+
+
 OWN = {"onset": {"fixed": False}, "force_offset": {"fixed": False}}
 
 
@@ -55,14 +62,14 @@ def touched(tmp_path_factory):
 def test_used_curves_come_back_with_the_corner_of_the_fit(touched):
     """What the fit stored as predicted, to 1e-9 N: the same rounded corner."""
     _, read = touched
-    with h5py.File(read.path) as file:
+    with h5py.File(read.origin.path) as file:
         stored_force = np.split(file["data/predicted"][()], 6)
-    found = held_out.compare(read, read.curves)
+    found = held_out.compare(read, pressed(read).curves)
     assert {c.in_fit for c in found} == {"yes"}
     for c, force in zip(found, stored_force, strict=True):
         assert np.allclose(c.prediction.force, force, rtol=0, atol=1e-9)
     # As a press that is asked for: with the trial its corner, else a sharp one at 0.
-    at = {"s": 80.0, "displacement": read.curves[1].displacement, "specimen": "T1"}
+    at = {"s": 80.0, "displacement": pressed(read).curves[1].displacement, "specimen": "T1"}
     same = jaxtrachea.predict(read, trial="t1", **at)
     assert np.allclose(same.force, stored_force[1], rtol=0, atol=1e-9)
     new = jaxtrachea.predict(read, **at)
@@ -132,8 +139,8 @@ def test_own_parameters_follow_those_that_are_kept():
     own = held_out._Own(
         (2,), np.zeros(1), FitStatus.CONVERGED, np.zeros(1, bool), slopes, sigma
     )  # fmt: skip
-    names = object.__new__(stored.StoredFit)  # no more of it is read
     free = [SimpleNamespace(name=name) for name in "abc"]
+    names = object.__new__(FitResult)  # no more of it is read
     object.__setattr__(names, "study", SimpleNamespace(free=free))
     got = held_out._merged(names, blank, own).covariance
 
@@ -173,13 +180,13 @@ def test_own_onset_of_a_press_of_another_size(touched):
     assert abs(x[0] - 3.0) < 0.2
     assert np.max(np.abs(found.prediction.force - force)) < 1e-3 * np.max(deep.force)
     # The band with nothing but the curve's own errors: SciPy's Jacobian, no kept covariance.
-    bare = dataclasses.replace(read, covariance=np.zeros_like(read.covariance))
+    bare = without_covariance(read)
     (found,) = held_out.compare(bare, [deep])
     D = deep.displacement
     k_1, k_3 = stiffness(read, 0)
     z = np.maximum(D - x[0], 0)
     J = np.stack([-(k_1 + 3 * k_3 * z**2) * (z > 0), np.ones_like(D)])
-    own = read.sigma[0, 0] ** 2 * np.linalg.inv(J @ J.T)
+    own = read.observed_sigma[0, 0] ** 2 * np.linalg.inv(J @ J.T)
     expected = np.sqrt(np.einsum("in,ij,jn->n", J, own, J))
     away = np.abs(D - x[0]) > 1.5
     assert np.allclose(found.prediction.se[away], expected[away], rtol=0.02)
@@ -225,8 +232,8 @@ def test_own_onset_is_fitted_and_its_band_is_that_of_least_squares(tmp_path):
     steps = np.eye(3) * 1e-6
     J = np.stack([(force(at + h) - force(at - h)) / 2e-6 for h in steps], axis=1)
     unit = np.diag([1.0, 0.01])
-    C = unit @ read.covariance[0][:2, :2] @ unit
-    sigma = read.sigma[0, 0]
+    C = unit @ read.uncertainty.covariance[0][:2, :2] @ unit
+    sigma = read.observed_sigma[0, 0]
     kept = J[:, :2] - np.outer(J[:, 2], J[:, 2] @ J[:, :2]) / (J[:, 2] @ J[:, 2])
     variance = np.sum(kept @ C * kept, axis=1) + sigma**2 * J[:, 2] ** 2 / (J[:, 2] @ J[:, 2])
     assert np.allclose(found.prediction.se, np.sqrt(variance), rtol=1e-4, atol=1e-6)
@@ -244,10 +251,10 @@ def test_own_onset_is_fitted_and_its_band_is_that_of_least_squares(tmp_path):
 def test_a_former_fit_with_other_steps_is_refused(touched):
     """Its lanes would keep scaled coordinates that mean other numbers here."""
     study, read = touched
-    assert read_hdf5(read.path, study).succeeded.all()
+    assert read_again(read.origin.path, study).succeeded.all()
     other = [dataclasses.replace(p, step=7 * p.step) if p.name == "onset" else p
              for p in study.parameters]  # fmt: skip
     model = dataclasses.replace(study.model, columns=columns_of(other))
     study = dataclasses.replace(study, model=model, parameters=tuple(other))
-    with pytest.raises(stored.NoResults, match="other steps; fit again"):
-        read_hdf5(read.path, study)
+    with pytest.raises(NoResults, match="other values, bounds or steps; fit again"):
+        read_again(read.origin.path, study)

@@ -19,7 +19,7 @@ from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
-from jaxtrachea.inference.analyses.posterior import POSTERIOR, posterior_rows
+from jaxtrachea.inference.analyses.posterior import POSTERIOR, posterior_table
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.estimate import lane_of
 from jaxtrachea.inference.posterior import Posterior, log_density, posterior
@@ -234,9 +234,11 @@ def test_poor_chains_are_said_beside_the_estimates():
     estimates = text.partition("## Estimates")[2].partition("## What")[0]
     assert "The posterior of 1 of 1 fits is not to be trusted" in estimates
     assert "poor: R-hat 1.550, 8 effective draws" in estimates
-    assert [row[2:4] + row[-1:] for row in posterior_rows(drawn, [0])] == [["–", "–", "poor"]] * 2
+    assert [row[2:4] + row[-1:] for row in posterior_table(drawn, [0]).cells] == [
+        ["–", "–", "poor"]
+    ] * 2
     rows = list(parameter_rows(found))
-    assert rows[0]["posterior_low95"] == rows[0]["posterior_median"] == ""
+    assert rows[0]["posterior_low95"] is rows[0]["posterior_median"] is None
     said = [item for item in overview(found) if isinstance(item, str)]
     assert any("not to be trusted" in text for text in said)
     assert poor(found)

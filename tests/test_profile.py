@@ -13,7 +13,7 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.files.tables import interval
+from jaxtrachea.files.table import Column, Interval
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
@@ -163,7 +163,8 @@ def test_what_one_position_cannot_tell_is_open():
     assert found.end[0].tolist() == [ProfileEnd.BOUND, ProfileEnd.OPEN]
     flat = found.statistic[1]
     assert np.nanmax(np.abs(flat)) < 1e-3
-    assert interval(found.lower[1], found.upper[1], log=True) == "anything"
+    cell = Interval(found.lower[1], found.upper[1], log=True)
+    assert Column("k_1").text({"k_1": cell}) == "anything"
 
 
 def test_an_estimate_on_its_bound_has_the_other_side():

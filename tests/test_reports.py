@@ -20,7 +20,7 @@ from jaxtrachea.cli.terminal import Stages, progress_bar
 from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
-from jaxtrachea.files.tables import quoted, unquoted, write_csv
+from jaxtrachea.files.table import Table, quoted, unquoted, words
 from jaxtrachea.fitting.effective import share_independent
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
@@ -35,7 +35,6 @@ from jaxtrachea.inference.analyses.influence import (
     INFLUENCE,
     REASONS,
     influence_cell,
-    influence_section,
 )
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import LeftOut
@@ -98,7 +97,11 @@ def shown(items, width=80):
     """What a terminal of this width shows."""
     console = Console(width=width, file=io.StringIO(), force_terminal=False)
     for item in items:
-        console.print(item if isinstance(item, str) else wide_table(*item), emoji=False)
+        if isinstance(item, str):
+            console.print(item, emoji=False)
+            continue
+        console.print(wide_table(item), emoji=False)
+        console.print(item.more, emoji=False)
     return console.file.getvalue()
 
 
@@ -110,7 +113,7 @@ def test_formulas_are_quoted_and_read_back(tmp_path):
     assert quoted("a=b") == "a=b"
     assert quoted(-1.5) == -1.5
     rows = [{"specimen": t, "=head": -1.5} for t in texts]
-    write_csv(tmp_path / "t.csv", rows)
+    Table(rows).write_csv(tmp_path / "t.csv")
     with (tmp_path / "t.csv").open(newline="", encoding="utf-8") as stream:
         cells = [row for row in csv.reader(stream)][1:]
     assert all(cell[0][:1] not in tuple("=+-@\t\r＝") or not cell[0] for cell in cells)
@@ -126,7 +129,7 @@ def test_formulas_are_quoted_and_read_back(tmp_path):
 
 
 def test_summary_quotes_what_specimens_are_called(many, tmp_path):
-    write_csv(tmp_path / "s.csv", list(lane_rows(many)))
+    Table(lane_rows(many)).write_csv(tmp_path / "s.csv")
     with (tmp_path / "s.csv").open(newline="", encoding="utf-8") as stream:
         names = [row["specimen"] for row in csv.DictReader(stream)]
     assert names[3] == "'=1+1"
@@ -214,17 +217,17 @@ def test_no_column_is_cut_without_an_ellipsis(width):
     head = ["specimen", "parameter", "value", "95 % interval", "a very long heading", "verdict"]
     rows = [["T1", "k_1 [N/mm]", "1.234", "1.2 … 1.3", "0.5", "structurally not"],
             ["x" * 200, "k_3", "–", "anything", "1", "weak"]]  # fmt: skip
-    text = shown([("All", head, rows)], width)
+    text = shown([words("All", head, rows)], width)
     lines = text.splitlines()
     assert max(map(len, lines)) <= width
-    words = text.replace("\n", " ").split()
+    found = text.replace("\n", " ").split()
     for name in head[2:]:
-        cut = [w for w in name.split() if w not in words]
-        assert all(any(v.endswith("…") and w.startswith(v[:-1]) for v in words) for w in cut)
-    assert any(w.startswith("xxx") and w.endswith("…") for w in words)
+        cut = [w for w in name.split() if w not in found]
+        assert all(any(v.endswith("…") and w.startswith(v[:-1]) for v in found) for w in cut)
+    assert any(w.startswith("xxx") and w.endswith("…") for w in found)
     if width >= 40:
         for cell in ("1.234", "structurally", "weak", "anything"):
-            assert cell in words
+            assert cell in found
 
 
 def test_terminal_takes_names_as_they_are(many):
@@ -274,7 +277,7 @@ def test_influence_says_why_there_is_no_number(dense):
     diagnosed = influence(dense)
     study = dense.study
     assert influence_cell(diagnosed, 0, 0, 2).endswith(", own")
-    text = "\n".join(influence_section(diagnosed))
+    text = "\n".join(INFLUENCE.report(diagnosed, [0]))
     assert REASONS in text
     status = np.array([FitStatus.MAX_ITERATIONS])
     failed = dataclasses.replace(diagnosed, result=dataclasses.replace(dense, status=status))
@@ -429,24 +432,24 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
         dense,
         converged=np.ones(14, bool),
     )
-    rows, further = left_out_table(left_out)
+    table = left_out_table(left_out)
+    rows, further = table.cells, table.more
     shares = ["–", *(f"{v}.00 %" for v in (14, 13, 12, 10, 9, 8, 7, 6, 5, 4, 3))]
     assert [row[3] for row in rows[:-1]] == shares
-    assert further == ["Worst first; and 2 more, see left_out.csv"]
+    assert further == "Worst first; and 2 more, see left_out.csv"
     findings = Findings(dense, ((LEFT_OUT, left_out),))
     text = report_text("T", findings, [])
     section = text.split("## Leaving one curve out")[1].split("##")[0]
     lines = [line for line in section.splitlines() if line.startswith("| ")][2:14]
     assert [line.split(" | ")[3] for line in lines] == shares
-    assert f"{further[0]}." in section
+    assert f"{further}." in section
     items = list(overview(findings))
-    assert rows in [item[2] for item in items if not isinstance(item, str)]
-    assert further[0] in items
+    assert (rows, further) in [(v.cells, v.more) for v in items if not isinstance(v, str)]
     few = LeftOut(
         lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense.study, dense,
         converged=np.ones(4, bool),
     )  # fmt: skip
-    assert [row[1] for row in left_out_table(few)[0][:-1]] == ["1", "2", "1", "1"]
+    assert [row[1] for row in left_out_table(few).cells[:-1]] == ["1", "2", "1", "1"]
 
 
 def test_counts_of_the_progress_bar_never_pass_the_total():

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
-from jaxtrachea.files.tables import markdown_table, number, write_csv
+from jaxtrachea.files.table import Column, Interval, Table, number, words
 from jaxtrachea.fitting.effective import lag_correlation
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
@@ -20,7 +20,7 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.inference.analyses.cross_validation import left_out_rows
+from jaxtrachea.inference.analyses.cross_validation import left_out_table
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
@@ -90,7 +90,7 @@ def test_page_names_every_dataset(result, tmp_path):
     with h5py.File(tmp_path / "r.h5") as file:
         file.visititems(lambda name, item: found.__setitem__(name, getattr(item, "shape", None)))
         assert json.loads(file.attrs["provenance"]) == {"a": 1}
-        assert (file.attrs["schema"], file.attrs["schema_version"]) == ("jaxtrachea-results", 3)
+        assert (file.attrs["schema"], file.attrs["schema_version"]) == ("jaxtrachea-results", 4)
         assert json.loads(file["unknowns"].attrs["units"])["k_3"] == "N/mm^3"
     shapes = {name: shape for name, shape in found.items() if shape is not None}
     assert sorted(shapes) == sorted(columns("## results.h5"))
@@ -158,7 +158,7 @@ def test_flat_combination_in_words(result):
 
 def test_rows_with_different_keys_make_one_table(tmp_path, result):
     rows = [*lane_rows(result), bad_row(BAD)]
-    write_csv(tmp_path / "s.csv", rows)
+    Table(rows).write_csv(tmp_path / "s.csv")
     with (tmp_path / "s.csv").open(newline="") as stream:
         *_, last = csv.DictReader(stream)
     assert last["status"] == "bad_data"
@@ -173,9 +173,7 @@ def test_leaving_out_predicts_from_the_other_trial():
     assert curves_to_leave_out(study) == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert np.allclose(left_out.ratio, [1 / 1.02 - 1, 0.02] * 2, atol=1e-6)
     assert np.all(np.isnan(left_out.joints))
-    rows = left_out_rows(left_out)
-    assert rows[-1][2] == "1.98 %"
-    assert rows[-1][4] == "–"
+    assert left_out_table(left_out).cells[-1][2:] == ["1.98 %", "1.10 %", "–"]
 
 
 def test_predictions_are_model_minus_data(result):
@@ -233,8 +231,56 @@ def test_rms_skips_what_is_not_there():
 
 def test_numbers_and_tables_for_people():
     assert [number(v) for v in (1.23456, np.nan, np.inf, 1e6)] == ["1.235", "–", "inf", "1e+06"]
-    table = markdown_table(["a", "b"], [["x|y", "two\nlines"]])
-    assert table == "| a | b |\n| --- | --- |\n| x\\|y | two lines |"
+    table = words("", ["a", "b"], [["x|y", "two\nlines"]])
+    assert table.markdown() == "| a | b |\n| --- | --- |\n| x\\|y | two lines |"
+
+
+ROWS = [
+    {"name": "=a", "force [N]": 1.23456, "share": 0.025, "n": 3, "ends": (0.5, 2.0)},
+    {"name": "b", "force [N]": np.nan, "share": None, "n": 4, "ends": (np.nan, np.nan)},
+]
+COLUMNS = [
+    Column("who", "name"), Column("F", "force [N]", unit="N", digits=3),
+    Column("share", unit="%", decimals=1), Column("n", null="none"),
+    Column("interval", lambda row: Interval(*row["ends"])),
+]  # fmt: skip
+
+
+def test_one_table_is_rendered_everywhere(tmp_path):
+    """Files have every cell exactly, people the columns with unit, digits and null text."""
+    table = Table(ROWS, COLUMNS, title="T", more="and 1 more")
+    assert table.head == ["who", "F", "share", "n", "interval"]
+    assert table.cells == [["=a", "1.23 N", "2.5 %", "3", "0.5 … 2"], ["b", "–", "–", "4", "–"]]
+    assert table.paragraphs()[1] == "and 1 more."
+    assert "<td>1.23 N</td>" in table._repr_html_()
+    assert repr(table).splitlines()[1] == "=a   1.23 N  2.5 %  3  0.5 … 2"
+    Table([{k: v for k, v in row.items() if k != "ends"} for row in ROWS]).write_csv(
+        tmp_path / "t.csv"
+    )
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    assert lines == ["name,force [N],share,n", "'=a,1.23456,0.025,3", "b,nan,,4"]
+    with h5py.File(tmp_path / "t.h5", "w") as file:
+        Table({k: row[k] for k in ("name", "share", "n")} for row in ROWS).write_hdf5(file)
+        assert [v.decode() for v in file["name"][()]] == ["=a", "b"]
+        np.testing.assert_array_equal(file["share"], [0.025, np.nan])
+        assert file["n"].dtype.kind == "i"
+    assert len(table.first(1, "and {} more, see x")) == 1
+    assert table.first(1, "and {} more, see x").more == "and 1 more, see x"
+
+
+@pytest.mark.parametrize(
+    ("cell", "text"),
+    [
+        (Interval(-np.inf, np.inf), "anything"),
+        (Interval(0.0, np.inf, log=True), "anything"),
+        (Interval(0.0, 2.0, log=True), "up to 2"),
+        (Interval(0.0, 2.0), "0 … 2"),
+        (Interval(1.5, np.inf), "from 1.5"),
+        (True, "True"), (None, "–"), ("", ""), (7, "7"), (1e-9, "1e-09"),
+    ],
+)  # fmt: skip
+def test_cells_for_people(cell, text):
+    assert Column("a").text({"a": cell}) == text
 
 
 def test_output_folder_is_new_or_empty(tmp_path):

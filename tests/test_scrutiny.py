@@ -10,7 +10,7 @@ import specimens
 from scipy.special import stdtrit
 from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
-from jaxtrachea.files.tables import write_csv
+from jaxtrachea.files.table import Table
 from jaxtrachea.fitting import scrutiny
 from jaxtrachea.fitting import structure as structures
 from jaxtrachea.fitting.fit import fit
@@ -23,7 +23,7 @@ from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report.fit import estimate_rows, spread_rows
+from jaxtrachea.report.tables import estimate_table, spread_table
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.rows import lane_rows, parameter_rows
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -142,7 +142,7 @@ def test_a_twin_skeleton_belongs_to_the_interval(result, pressed):
 @pytest.mark.compiling
 def test_all_that_is_written_agrees(result, tmp_path):
     lanes = range(result.lanes)
-    table = [row[-1] for row in estimate_rows(result, lanes)]
+    table = [row[-1] for row in estimate_table(result, lanes).cells]
     rows = list(parameter_rows(Findings(result)))
     assert [row["verdict"] for row in rows] == table
     summary = [row[f"{n} verdict"] for row in lane_rows(result) for n in NAMES]
@@ -150,7 +150,7 @@ def test_all_that_is_written_agrees(result, tmp_path):
     write_hdf5(tmp_path / "r.h5", Findings(result), {})
     with h5py.File(tmp_path / "r.h5") as file:
         assert [v.decode() for v in file["unknowns/verdict"][()].ravel()] == table
-    write_csv(tmp_path / "p.csv", rows)
+    Table(rows).write_csv(tmp_path / "p.csv")
     with (tmp_path / "p.csv").open(newline="") as stream:
         low = [float(row["low95"]) for row in csv.DictReader(stream)]
     assert low == [judgement(result, k, i).low for k in lanes for i in range(4)]
@@ -216,7 +216,7 @@ def test_local_intervals_end_at_the_bounds(result):
 def test_population_and_medians_take_what_is_identifiable(result):
     with pytest.raises(ValueError, match="no parameter is determined in 3 specimens"):
         population(result)
-    told = [row[1] for row in spread_rows(result)]
+    told = [row[1] for row in spread_table(result).cells]
     assert told == ["1 of 6", "1 of 6", "2 of 6", "2 of 6"]
 
 

@@ -16,13 +16,13 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.cli.specification import parameters_of, study_of, usable
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.design.candidates import candidates_of
 from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction.predict import check_position
-from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.section import geometry_of
 
@@ -374,7 +374,7 @@ def test_places_of_a_tool_with_a_width():
     """Predictions and designs leave half a width at both ends, as the fit does."""
     D, F = curve(0)
     study = build_study([Curve("T01", "a", 75.0, 0.0, D, F)], table_1(), Options(half_width=12.0))
-    stored = object.__new__(StoredFit)  # of which only the study is read
+    stored = object.__new__(FitResult)  # of which only the study is read
     object.__setattr__(stored, "study", study)
     for s in (12.0, 80.0, 148.0):
         check_position(stored, s)

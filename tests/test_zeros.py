@@ -20,7 +20,6 @@ from jaxtrachea.measurements.read import Curve, Measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction.held_out import compare
 from jaxtrachea.prediction.sources import source_of
-from jaxtrachea.results.stored import from_result
 from jaxtrachea.trachea.geometry import table_1
 
 AIR, SIGMA = 0.6, 0.005
@@ -198,19 +197,17 @@ def test_fit_of_a_mixed_study(fitted):
 @pytest.mark.compiling
 def test_predictions_of_a_mixed_fit(fitted):
     """The fit's own trials, a new press, and new records: each with the zeros of its own record."""
-    stored = from_result(fitted)
-    np.testing.assert_allclose(stored.first_touch, fitted.first_touch[0])
-    assert source_of(stored, "T", "0").own == ()
+    assert source_of(fitted, "T", "0").own == ()
     new = [*hardening(6, air=(0.0, 0.3)), *hardening(7, air=(1.0,))]
     new = [dataclasses.replace(c, trial=f"n{i}") for i, c in enumerate(new)]
-    found = compare(stored, new)
+    found = compare(fitted, new)
     own = ["onset fitted" in f.prediction.message for f in found]
     assert own == [False, True, True]
     for f in found:
         assert np.std(f.residual) < 1.5 * SIGMA
     clean = build_study(hardening(8, air=(0.0, 0.0)), table_1(), TOTAL)
     assert not any(p.name == "onset" for p in clean.free)
-    stored = from_result(fit(clean, Settings(starts=2, more_starts=0)))
+    stored = fit(clean, Settings(starts=2, more_starts=0))
     (only,) = compare(stored, new[2:])
     assert "onset fitted" in only.prediction.message
     assert np.std(only.residual) < 1.5 * SIGMA

@@ -2,8 +2,9 @@
 
 import dataclasses
 import time
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -21,18 +22,6 @@ CrossOption = Annotated[
 ]
 #: Specimens of a terminal table; the files hold all.
 MANY = 8
-HEAD = [
-    "specimen",
-    "model",
-    "k",
-    "-2 ln L",
-    "dAICc",
-    "deflated",
-    "weight",
-    "BIC",
-    "left out",
-    "worst",
-]
 
 
 def compare(
@@ -111,13 +100,13 @@ def _write(folder: Path, specs, loaded, models, clock):
 
     import jax
 
+    from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.provenance import provenance
-    from jaxtrachea.files.tables import write_csv, write_text
     from jaxtrachea.inference.comparison import compared
 
     rows, failed = compared(models)
     sentences = _sentences(models, rows)
-    write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
+    _table(rows).write_csv(folder / "compare.csv")
     write_text(folder / "report.md", _report(rows, sentences, failed, models))
     ends = [*clock, time.perf_counter()]
     timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
@@ -187,32 +176,29 @@ def _why_nothing(model) -> str:
     return f"no specimen has a second position or trial{apart}"
 
 
-def _cells(rows) -> list[list[str]]:
-    from jaxtrachea.files.tables import number
+def _table(rows: Iterable[Any]):
+    """Models of one specimen after the other."""
+    from jaxtrachea.files.table import Column, Table
 
-    return [
-        [row.specimen, row.model, str(row.unknowns), number(row.deviance, 6), number(row.delta, 3),
-         number(row.deflated, 3), number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out),
-         _worst(row)]
-        for row in rows
+    share = Column("", "worst", unit="%", decimals=2)
+
+    def worst(row) -> str:
+        return share.text(row) + (f" ({row['worst_place']})" if row["worst_place"] else "")
+
+    columns = [
+        Column("specimen"), Column("model"), Column("k", "unknowns"),
+        Column("-2 ln L", "deviance", digits=6), Column("dAICc", "delta", digits=3),
+        Column("deflated", digits=3), Column("weight", digits=2), Column("BIC", digits=6),
+        Column("left out", "left_out", unit="%", decimals=2), Column("worst", worst),
     ]  # fmt: skip
-
-
-def _percent(share: float) -> str:
-    return "–" if share != share else f"{100 * share:.2f} %"
-
-
-def _worst(row) -> str:
-    return _percent(row.worst) + (f" ({row.worst_place})" if row.worst_place else "")
+    return Table(map(dataclasses.asdict, rows), columns, title="Models")
 
 
 def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
-    from jaxtrachea.files.tables import markdown_table
-
     parts = [
         "# Which model",
         "\n".join(f"- {specimen}: {text}." for specimen, text in sentences.items()),
-        markdown_table(HEAD, _cells(rows)),
+        _table(rows).markdown(),
         "k: fitted parameters and estimated standard deviations. dAICc: above the best model; "
         "below 2 models cannot be told apart, from 10 on the worse one has next to no support. "
         "deflated: the same where the likelihood counts only as many samples as are independent, "
@@ -235,8 +221,7 @@ def _print(rows, sentences, failed: int, models, folder: Path) -> None:
         names.sort(key=lambda name: "decisively (" in sentences[name])
     shown = names[:MANY] + [name for name in sentences if name == "(all)"]
     for name in shown:
-        cells = _cells([row for row in rows if row.specimen == name])
-        out.print(table("Models", HEAD, cells))
+        out.print(table(_table(row for row in rows if row.specimen == name)))
         out.print(escape(f"{name}: {sentences[name]}"), highlight=False, emoji=False)
     if len(names) > MANY:
         out.print(f"and {len(names) - MANY} more specimens, see compare.csv")

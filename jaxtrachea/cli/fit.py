@@ -157,7 +157,7 @@ def _opened(options: FitOptions, now, study):
 
 def _finished(options: FitOptions, target: Path, now, study):
     """A rerun of the failed lanes of a finished run, if that is asked for."""
-    from jaxtrachea.results.hdf5 import read_hdf5
+    from jaxtrachea.results.read import read_again
     from jaxtrachea.runs import manifest, rerun
 
     was = rerun.read_manifest(target / "results.h5")
@@ -171,7 +171,7 @@ def _finished(options: FitOptions, target: Path, now, study):
         raise Stop(
             "--rerun-failed: specimens of a joint fit are fitted together; change [fit] starts"
         )
-    result = read_hdf5(target / "results.h5", study)
+    result = read_again(target / "results.h5", study)
     failed = rerun.failed_lanes(result)
     if not failed:
         to_stderr(f"no lane of {escape(str(target))} failed; there is nothing to fit again")
@@ -269,7 +269,7 @@ def _cluster(address: str | None) -> Iterator[Any]:
 def _failures_as_messages(options: FitOptions) -> Iterator[None]:
     """Failures to open or write a run become messages."""
     from jaxtrachea.files.lock import Busy, NoLocks
-    from jaxtrachea.results.stored import NoResults
+    from jaxtrachea.results.read import NoResults
     from jaxtrachea.runs.cluster import Lost
     from jaxtrachea.runs.folder import NoRun
 

@@ -141,18 +141,21 @@ def _read(options: CheckOptions | InitOptions) -> Sources:
 
 def _print_columns(sources: Sources, out: Console) -> None:
     """The columns of the files, those with the same columns together."""
+    from jaxtrachea.files.table import Column, Table
+
     groups: dict[tuple, list[Path]] = {}
     for path, head in sources.heads.items():
         if head.columns:
             groups.setdefault((head.format, head.columns), []).append(path)
     for (kind, columns), paths in [*groups.items()][:TABLES]:
         more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-        rows = [
-            [column.name, column.unit or "–", role_in_words(column.role, sources.guessed)]
-            for column in columns[:MANY]
-        ]
-        head = ["column", "unit", "read as"]
-        out.print(table(f"{paths[0].name}{more} ({kind})", head, rows, ("unit", "read as")))
+        rows = (
+            {"column": c.name, "unit": c.unit or None,
+             "read as": role_in_words(c.role, sources.guessed)}
+            for c in columns[:MANY]
+        )  # fmt: skip
+        heads = [Column("column"), Column("unit", left=True), Column("read as", left=True)]
+        out.print(table(Table(rows, heads, title=f"{paths[0].name}{more} ({kind})")))
         if len(columns) > MANY:
             out.print(f"... and {len(columns) - MANY} more columns")
     if len(groups) > TABLES:

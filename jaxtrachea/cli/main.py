@@ -187,8 +187,8 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
             raise Stop(f"{spec}: {reason}")
         write_tables(folder, findings)
         say_lost(draw_analyses(folder, findings))
-    chosen = ((analysis.shown, found) for analysis, found in findings.at("design"))
-    show((item for shown, found in chosen for item in shown(found, [])), folder.parent)
+    chosen = (analysis.terminal(found, []) for analysis, found in findings.at("design"))
+    show(itertools.chain.from_iterable(chosen), folder.parent)
     raise typer.Exit(1 if measurements.bad else 0)
 
 

@@ -48,7 +48,7 @@ def predict(
     as_specimen: AsOption = None,
 ) -> None:
     """Predict force curves from a finished fit, with 95 % bands."""
-    from jaxtrachea.results.stored import NoResults, read_results
+    from jaxtrachea.results.read import NoResults, read_results
 
     set_up_jax()
     given = [*(data or []), *(files or [])]
@@ -65,11 +65,13 @@ def predict(
         raise Stop(str(error)) from None
     except OSError as error:
         raise Stop(f"{results}: cannot be read ({error.strerror}); check its rights") from None
-    if as_specimen is not None and as_specimen not in stored.specimens:
-        raise Stop(f"--as: {_unknown('specimen', as_specimen, stored.specimens)}")
-    name = (stored.path.parent if results.is_dir() else stored.path.absolute().parent).absolute()
+    path = stored.origin.path
+    known = dict.fromkeys(c.specimen for lane in stored.study.curves for c in lane)
+    if as_specimen is not None and as_specimen not in known:
+        raise Stop(f"--as: {_unknown('specimen', as_specimen, known)}")
+    name = path.absolute().parent
     default = Path("out") / f"{name.name}-predict"
-    digest = hashlib.sha256(stored.path.read_bytes()).hexdigest()
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if at:
         code = _predict_at(stored, at, out_dir, default, digest)
     else:
@@ -87,8 +89,9 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     """Predictions at chosen positions; returns the exit code."""
     import numpy as np
 
+    from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.pictures import without_lost
-    from jaxtrachea.files.tables import write_csv, write_text
+    from jaxtrachea.files.table import Table
     from jaxtrachea.prediction import report, tables
     from jaxtrachea.prediction.plots import draw_predictions
     from jaxtrachea.prediction.predict import predict_sources
@@ -98,21 +101,20 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
         curves = predict_sources(stored, sources, s, depths, aside=aside)
         stop_if_asked()
         rings = np.asarray(stored.study.model.geometry.ring_positions)
-        write_csv(
-            folder / "predictions.csv", [r for p in curves for r in tables.prediction_rows(p)]
-        )
-        write_csv(folder / "bands.csv", [r for p in curves for r in tables.band_rows(p)])
-        joints = [
-            r for p in curves for r in tables.joint_rows(p, rings, range(len(p.displacement)))
-        ]
+        rows = {
+            "predictions": [r for p in curves for r in tables.prediction_rows(p)],
+            "bands": [r for p in curves for r in tables.band_rows(p)],
+        }
         if any(p.has_skeleton for p in curves):
-            write_csv(folder / "joints.csv", joints)
+            every = (tables.joint_rows(p, rings, range(len(p.displacement))) for p in curves)
+            rows["joints"] = [r for of_curve in every for r in of_curve]
+        for name, content in rows.items():
+            Table(content).write_csv(folder / f"{name}.csv")
         lost = draw_predictions(folder, curves)
         say_lost(lost)
         text = without_lost(report.report_at(stored, digest, curves), lost)
         write_text(folder / "report.md", text)
-    rows, more = report.shortened(report.at_table(curves), "bands.csv")
-    _show("Predictions, at the deepest displacement", report.AT_HEAD, rows, more)
+    _show("Predictions, at the deepest displacement", report.at_table(curves))
     _end(report.outcomes(curves), folder.parent)
     return 0 if all(p.status.predicts for p in curves) else 1
 
@@ -121,22 +123,24 @@ def _asked(stored, texts: Sequence[str]):
     """Sources, positions, displacements, and angle with direction, of every --at."""
     from jaxtrachea.measurements.presses import parse_presses
     from jaxtrachea.prediction.predict import check_aside, check_position
+    from jaxtrachea.prediction.pressed import pressed
     from jaxtrachea.prediction.sources import source_of
 
+    fitted = pressed(stored)
     needs = stored.study.model.options.coupling == "series"
     sources, places, depths, aside = [], [], [], []
     for text in texts:
         try:
             asked = parse_presses(text, needs_position=needs)
             check_aside(stored, asked.phi, asked.direction)
-            names = stored.specimens if asked.specimen is None else (asked.specimen,)
-            if asked.specimen is not None and asked.specimen not in stored.specimens:
-                raise ValueError(_unknown("specimen", asked.specimen, stored.specimens))
+            names = fitted.specimens if asked.specimen is None else (asked.specimen,)
+            if asked.specimen is not None and asked.specimen not in fitted.specimens:
+                raise ValueError(_unknown("specimen", asked.specimen, fitted.specimens))
             s = [float("nan")] if asked.s is None else asked.s.tolist()
             for place in s:
                 if asked.s is not None:
                     check_position(stored, place)
-            trials = dict.fromkeys(c.trial for c in stored.curves if c.specimen in names)
+            trials = dict.fromkeys(c.trial for c in fitted.curves if c.specimen in names)
             if asked.trial is not None and asked.trial not in trials:
                 raise ValueError(_unknown("trial", asked.trial, tuple(trials)))
         except ValueError as error:
@@ -155,8 +159,9 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     """Measured curves against predictions; returns the exit code."""
     import numpy as np
 
+    from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.pictures import without_lost
-    from jaxtrachea.files.tables import write_csv, write_text
+    from jaxtrachea.files.table import Table
     from jaxtrachea.fitting.unread import along_the_normal
     from jaxtrachea.prediction import report, tables
     from jaxtrachea.prediction.held_out import compare, pressable
@@ -186,17 +191,16 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
         if not any(c.prediction.has_skeleton for c in compared):
             del rows["joints"]
         for name, content in rows.items():
-            write_csv(folder / f"{name}.csv", content)
-        errors = tables.error_rows(compared, bad, stored.tool_radius, rings)
-        write_csv(folder / "errors.csv", errors)
+            Table(content).write_csv(folder / f"{name}.csv")
+        errors = tables.error_rows(compared, bad, stored.origin.reading.get("tool_radius"), rings)
+        Table(errors).write_csv(folder / "errors.csv")
         lost = draw_compared(folder, compared)
         say_lost(lost)
         text = report.report_data(stored, digest, compared, bad, errors, notes)
         write_text(folder / "report.md", without_lost(text, lost))
     for note in notes:
         to_stderr(f"[yellow]note:[/] {escape(note)}")
-    shown, more = report.shortened(report.error_table(errors), "errors.csv")
-    _show("Measured against predicted, worst first", report.ERROR_HEAD, shown, more)
+    _show("Measured against predicted, worst first", report.error_table(errors))
     _end(report.outcomes([c.prediction for c in compared]), folder.parent)
     good = all(c.prediction.status.predicts for c in compared)
     return 0 if good and not bad else 1
@@ -214,12 +218,13 @@ def _markers(compared, rings: int):
     return found
 
 
-def _show(title: str, head, rows, more: str) -> None:
+def _show(title: str, shown) -> None:
     out = Console()
-    if rows:
-        out.print(table(title, head, rows))
-    if more:
-        out.print(more)
+    shown.title = title
+    if shown:
+        out.print(table(shown))
+    if shown.more:
+        out.print(shown.more)
 
 
 def _end(lines: Sequence[str], folder: Path) -> None:

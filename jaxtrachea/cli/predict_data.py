@@ -34,7 +34,7 @@ def measured_curves(stored, given: Sequence[str]):
             spec, root = load_fit_spec(path), path.parent
             _same_model(stored, path, spec)
         else:
-            reading = _as_written(stored.reading)
+            reading = _as_written(stored.origin.reading)
             spec = FitSpec.model_validate({"data": reading | {"files": list(given)}})
             root = Path()
             if reading.get("s") is not None:
@@ -47,7 +47,7 @@ def measured_curves(stored, given: Sequence[str]):
         raise Stop(f"--data: {error}") from None
     except ValidationError:
         raise Stop(
-            f"{stored.path}: damaged or of another version (how the data were read is not "
+            f"{stored.origin.path}: damaged or of another version (how the data were read is not "
             "understood); give --data a specification with a [data] section"
         ) from None
     return measurements, notes
@@ -60,7 +60,7 @@ def _refuse_results(given: Sequence[str]) -> None:
     from jaxtrachea.measurements.read import DataError
     from jaxtrachea.measurements.readers.hdf5_values import attribute
     from jaxtrachea.measurements.readers.safe_hdf5 import opened
-    from jaxtrachea.results.stored import SCHEMA
+    from jaxtrachea.results.hdf5 import SCHEMA
 
     for name in given:
         path = Path(name)

@@ -43,10 +43,11 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
 
     import jax
 
+    from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.html import page
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.provenance import provenance
-    from jaxtrachea.files.tables import write_csv, write_text
+    from jaxtrachea.files.table import Table
     from jaxtrachea.fitting.zeros_told import cells
     from jaxtrachea.measurements.usage_tables import usage_rows, usage_section
     from jaxtrachea.report.fit import report_text
@@ -57,8 +58,8 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.trials.differences import differing_trials
     from jaxtrachea.trials.repeats import trial_remarks, trial_sentences
 
-    write_csv(folder / "summary.csv", summary_rows(findings, measurements.bad))
-    write_csv(folder / "parameters.csv", list(parameter_rows(findings)))
+    Table(summary_rows(findings, measurements.bad)).write_csv(folder / "summary.csv")
+    Table(parameter_rows(findings)).write_csv(folder / "parameters.csv")
     apart = differing_trials(measurements.curves)
     zeros, of_trials = cells(findings.result.study), trial_remarks(apart)
     rows = []
@@ -66,7 +67,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
         curve = str(row["specimen"]), str(row["trial"])
         remarks = "; ".join(filter(None, (str(row["remarks"]), of_trials.get(curve))))
         rows.append(row | {"remarks": remarks} | zeros.get(curve, {}))
-    write_csv(folder / "curves.csv", rows)
+    Table(rows).write_csv(folder / "curves.csv")
     write_tables(folder, findings)
     drawn, lost = draw_all(folder, findings)
     say_lost(lost)
@@ -92,11 +93,9 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
 
 def write_tables(folder: Path, findings) -> None:
     """The CSV files of the analyses."""
-    from jaxtrachea.files.tables import write_csv
-
     for analysis, found in findings.found:
         for name, rows in analysis.tables(found).items():
-            write_csv(folder / name, list(rows))
+            rows.write_csv(folder / name)
 
 
 def show(items, folder: Path) -> None:
@@ -106,7 +105,9 @@ def show(items, folder: Path) -> None:
         if isinstance(item, str):
             out.print(escape(item), highlight=False, emoji=False)
         else:
-            out.print(table(*item))
+            out.print(table(item))
+            if item.more:
+                out.print(escape(item.more), highlight=False, emoji=False)
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
 
 

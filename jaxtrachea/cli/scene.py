@@ -33,6 +33,7 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
     """Show which effects a scene needs, why, and their cost."""
     from concurrent.futures import ThreadPoolExecutor
 
+    from jaxtrachea.files.table import words
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
@@ -47,7 +48,7 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
         # The program that `simulate` will load is compiled while the operations are counted.
         kept = beside.submit(Traced(run).compile, staged.scene, staged.material, staged.path)
         whole, found = shares(staged)
-        out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
+        out.print(table(words("Plan", head, plan_rows(staged.scene.plan, found), ("reason",))))
         out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
         with progress_bar(transient=True) as bar:
             bar.add_task("compiling for simulate", total=None)
@@ -293,7 +294,7 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
 def _write_json(folder: Path, made: dict) -> None:
     import json
 
-    from jaxtrachea.files.tables import write_text
+    from jaxtrachea.files.atomic import write_text
 
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 
@@ -315,28 +316,38 @@ def _print_rows(out) -> None:
     """A table of the rows: of more than `MANY` some, evenly, which its title says."""
     import numpy as np
 
+    from jaxtrachea.files.table import Column, Table
     from jaxtrachea.status import PressStatus
 
     count = len(out.s)
     pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
 
-    def number(x):
-        return f"{np.round(x, 9) + 0.0:.3g}"
+    def row(i: int) -> dict[str, object]:
+        def rounded(x) -> float:
+            return float(np.round(x, 9) + 0.0)
 
-    def share(v):
-        return "–" if np.isnan(v) else f"{100 * v:.0f} %"
+        vectors = {"force {} [N]": out.force[i], "skeleton {} [mm]": out.skeleton[i]}
+        return {
+            "row": i + 1,
+            "s [mm]": float(out.s[i]),
+            "phi [deg]": rounded(np.degrees(out.phi[i])),
+            "gap [mm]": None if out.gap is None else rounded(out.gap[i]),
+            "status": PressStatus(int(out.status[i])).name.lower(),
+            "depth/radius": float(out.depth_share[i]),
+        } | {
+            name.format(axis): rounded(v)
+            for name, vector in vectors.items()
+            for axis, v in zip("xyz", np.asarray(vector), strict=True)
+        }
 
-    rows = [
-        [str(i + 1), f"{out.s[i]:.4g}", number(np.degrees(out.phi[i])),
-         "–" if out.gap is None else number(out.gap[i]), *map(number, np.asarray(out.force[i])),
-         PressStatus(int(out.status[i])).name.lower(), share(out.depth_share[i]),
-         *map(number, np.asarray(out.skeleton[i]))]
-        for i in pick
+    columns = [
+        Column("row"), Column("s [mm]"),
+        *(Column(name, digits=3) for name in ("phi [deg]", "gap [mm]")),
+        *(Column(f"force {axis} [N]", digits=3) for axis in "xyz"), Column("status", left=True),
+        Column("depth/radius", unit="%", decimals=0),
+        *(Column(f"skeleton {axis} [mm]", digits=3) for axis in "xyz"),
     ]  # fmt: skip
-    head = ["row", "s [mm]", "phi [deg]", "gap [mm]"]
-    head += [f"force {axis} [N]" for axis in "xyz"] + ["status", "depth/radius"]
-    head += [f"skeleton {axis} [mm]" for axis in "xyz"]
     title = f"{count} rows"
     if len(pick) < count:
         title = f"{len(pick)} of {count} rows; all are in simulation.h5"
-    Console().print(table(title, head, rows, ("status",)))
+    Console().print(table(Table(map(row, pick.tolist()), columns, title=title)))

@@ -20,7 +20,6 @@ QuickOption = Annotated[
     bool,
     typer.Option("--quick", help="Faster start: programs compiled without optimisation."),
 ]
-HEAD = ["case", "dtype", "value", "gradient", "not finite", "verdict"]
 
 
 class _Dtype(enum.Enum):
@@ -52,7 +51,7 @@ def selfcheck(
     if not found:
         raise Stop(f"--only, --dtype {dtype}: none of these cases is run in this dtype")
     seconds = time.perf_counter() - start
-    out.print(table("Errors over their tolerance", HEAD, [_row(o) for o in found]))
+    out.print(table(_table(found)))
     for outcome in found:
         for fault in outcome.faults:
             out.print(f"{outcome.case} ({outcome.dtype}): {fault}", markup=False, highlight=False)
@@ -78,10 +77,20 @@ def _chosen(cases, only):
     return [c for c in cases if c.name in only or c.function in only]
 
 
-def _row(outcome) -> list[str]:
-    verdict = "ok" if outcome.passed else "FAILED"
-    errors = [f"{v:.2g}" for v in (outcome.value, outcome.gradient)]
-    return [outcome.case, outcome.dtype, *errors, str(outcome.nans), verdict]
+def _table(found):
+    """A row for each case and dtype."""
+    from jaxtrachea.files.table import Column, Table
+
+    columns = [
+        Column("case"), Column("dtype"), Column("value", digits=2), Column("gradient", digits=2),
+        Column("not finite", "nans"), Column("verdict"),
+    ]  # fmt: skip
+    names = ("case", "dtype", "value", "gradient", "nans")
+    rows = [
+        {name: getattr(o, name) for name in names} | {"verdict": "ok" if o.passed else "FAILED"}
+        for o in found
+    ]
+    return Table(rows, columns, title="Errors over their tolerance")
 
 
 def _summary(found, failed, seconds) -> str:

@@ -9,6 +9,8 @@ from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from rich.text import Text
 
+from jaxtrachea.files import table as typed
+
 #: Columns that say what a row is; repeated where a table goes on below.
 KEYS = ("specimen", "trial", "curve", "parameter", "model", "row", "level", "effect")
 
@@ -107,16 +109,11 @@ def _short(cell: str, widest: int) -> str:
     )
 
 
-def wide_table(title: str, head, rows, text: tuple[str, ...] = ()) -> WideTable:
-    """A table; an only specimen's name goes into the title.
-
-    Args:
-        title: above it.
-        head: names of the columns.
-        rows: of text.
-        text: columns set to the left, besides the first.
-    """
+def wide_table(table: typed.Table) -> WideTable:
+    """A table; an only specimen's name goes into the title."""
+    title, head, rows = table.title, table.head, table.cells
+    left = tuple(column.head for column in table.columns if column.left)
     if head[0] == "specimen" and len(rows) > 0 and len({row[0] for row in rows}) == 1:
         name = _short(rows[0][0], 60)
         title, head, rows = f"{title}: {name}", head[1:], [row[1:] for row in rows]
-    return WideTable(title, tuple(head), tuple(tuple(row) for row in rows), text)
+    return WideTable(title, tuple(head), tuple(tuple(row) for row in rows), left)

@@ -107,9 +107,9 @@ def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> 
 
     import jax
 
+    from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.pictures import save_each, without_lost
     from jaxtrachea.files.provenance import provenance
-    from jaxtrachea.files.tables import write_text
     from jaxtrachea.tradeoff.levels import BUILT_IN
     from jaxtrachea.tradeoff.page import lines, scene_text
     from jaxtrachea.tradeoff.plots import draw
@@ -131,6 +131,7 @@ def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> 
 
 
 def _print(rows) -> None:
+    from jaxtrachea.files.table import words
     from jaxtrachea.tradeoff.page import HEAD, KINDS, cells
 
     out = Console()
@@ -140,7 +141,8 @@ def _print(rows) -> None:
         body = [cells(point) for point in points if point["kind"] == kind]
         if body:
             head = [HEAD[i] for i in keep]
-            out.print(table(title, head, [[row[i] for i in keep] for row in body], ("level",)))
+            rows = [[row[i] for i in keep] for row in body]
+            out.print(table(words(title, head, rows, ("level",))))
     for row in rows:
         if "left_out" in row:
             text = f"left out: {row['ladder']}: {row['left_out']}"

@@ -73,3 +73,8 @@ def hdf5_file(path: Path, mode: str = "x") -> Iterator[Any]:
     with h5py.File(image, "w" if mode == "x" else mode) as file:
         yield file
     write_whole(path, image.getvalue())
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file."""
+    path.write_text(text, encoding="utf-8")

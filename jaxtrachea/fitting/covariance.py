@@ -17,6 +17,8 @@ from jaxtrachea.fitting.structure import leaving_alone
 
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7
+#: 97.5 % quantile of the normal distribution.
+NORMAL = 1.959963984540054
 
 
 class Uncertainty(NamedTuple):
@@ -157,7 +159,7 @@ def half_widths(
     dof: np.ndarray, *, noise_known: Bool[np.ndarray, " lanes"]
 ) -> Float[np.ndarray, " lanes"]:
     """Of 95 % intervals in standard errors: normal with known noise, else Student's t; (lanes,)."""
-    half = np.full(len(dof), 1.959963984540054)
+    half = np.full(len(dof), NORMAL)
     different, which = np.unique(np.maximum(dof, 1), return_inverse=True)
     of_t = stdtrit(different, 0.975)[which.reshape(-1)]
     return np.where((dof > 0) & ~noise_known, of_t, half)

@@ -42,18 +42,31 @@ def with_levels(study: Study, levels: Levels, force: Float[np.ndarray, "lanes T 
     # In units of an estimated sigma; of given ones beside each.
     sigma = np.where(levels.share > 0, levels.sigma, first_sigma(_plain(study))[:, 0])
     grown = share * plain if given else share / sigma[:, None, None]
-    precision = plain / np.hypot(1, grown)
-    lanes = study.lanes
-    changed = {"precision": precision}
-    if lanes.side_precision is not None:
-        changed["side_precision"] = np.where(lanes.side_precision > 0, precision, 0)
     shares = Shares(levels.share, None if given else sigma, plain)
-    return dataclasses.replace(study, lanes=lanes._replace(**changed), shares=shares)
+    return with_shares(study, shares, plain / np.hypot(1, grown))
 
 
 def _plain(study: Study) -> Study:
     """The study as if nothing were found yet."""
     return dataclasses.replace(study, shares=None)
+
+
+def as_weighed(study: Study) -> Study:
+    """The study with `shares`: all 0 where none has been found."""
+    if study.shares is not None:
+        return study
+    sigma = None if study.noise_given[0] else first_sigma(study)[:, 0]
+    none = np.zeros(len(study.unknowns))
+    shares = Shares(none, sigma, np.asarray(study.lanes.precision))
+    return dataclasses.replace(study, shares=shares)
+
+
+def with_shares(study: Study, shares: Shares, precision: Float[np.ndarray, "lanes T N"]) -> Study:
+    """The study with shares, and the precision of the forces that they made."""
+    changed = {"precision": precision}
+    if study.lanes.side_precision is not None:
+        changed["side_precision"] = np.where(study.lanes.side_precision > 0, precision, 0)
+    return dataclasses.replace(study, lanes=study.lanes._replace(**changed), shares=shares)
 
 
 def next_levels(result: FitResult) -> tuple[Levels, Float[np.ndarray, "lanes T N"]]:

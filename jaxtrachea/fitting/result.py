@@ -7,13 +7,14 @@ independent (`effective`); the one of independent residuals stands beside it.
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from jaxtrachea.files.table import Table
-from jaxtrachea.fitting.covariance import Uncertainty
+from jaxtrachea.fitting.covariance import NORMAL, Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.effective import Effective, effective
 from jaxtrachea.fitting.misfit import Misfit, Residuals, misfit
@@ -52,6 +53,20 @@ class Intervals(Protocol):
     def find(self, lane: int, unknown: int) -> int | None:
         """Row of an unknown; None if it has none."""
         ...
+
+
+class Origin(NamedTuple):
+    """Where a fit was read from; empty for one of this process.
+
+    Attributes:
+        path: of its results.h5.
+        reading: how the data were read, as in the [data] section.
+        files: SHA-256 by name of the files of data.
+    """
+
+    path: Path = Path()
+    reading: Mapping[str, Any] = {}
+    files: Mapping[str, str] = {}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -93,6 +108,8 @@ class FitResult:
             (lanes, P, 2).
         minima: minima that fit within the likelihood's threshold, the best one included; those
             that differ from it in an unknown that the structure does not leave open; (lanes,).
+        origin: where it was read from.
+        stored_residuals: of a fit that was read, so that the model is not evaluated again.
     """
 
     study: Study
@@ -119,6 +136,18 @@ class FitResult:
     evidence_high: np.ndarray
     evidence_end: np.ndarray
     minima: np.ndarray
+    origin: Origin = Origin()
+    stored_residuals: Prediction | None = None
+
+    def __repr__(self) -> str:
+        """One line: what was fitted to what."""
+        free = ", ".join(p.name for p in self.study.free) or "nothing"
+        curves = [c for lane in self.study.curves for c in lane]
+        read = f"{str(self.origin.path)!r}: " if self.origin.path != Path() else ""
+        return (
+            f"FitResult({read}{free} fitted to {len(curves)} curves of "
+            f"{len({c.specimen for c in curves})} specimen(s))"
+        )
 
     @property
     def lanes(self) -> int:
@@ -141,6 +170,21 @@ class FitResult:
         """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
         return self.sigma / precision_unit(self.study)
 
+    @property
+    def observed_sigma(self) -> np.ndarray:
+        """`sigma`; NaN where a lane has no samples of the kind, such as no markers; (lanes, 2)."""
+        return np.where(np.isnan(self.rms), np.nan, self.sigma)
+
+    @property
+    def half_width(self) -> np.ndarray:
+        """Half of a 95 % interval in standard errors, for predictions; (lanes,).
+
+        Infinite where noise is to be estimated and no sample is left to do it from: the normal
+        quantile stands there (`covariance.analyse`), which Student's t never reaches.
+        """
+        half = self.uncertainty.half_width
+        return np.where((half == NORMAL) & (not self.study.noise_given[0]), np.inf, half)
+
     @functools.cached_property
     def relative(self) -> np.ndarray:
         """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
@@ -154,6 +198,8 @@ class FitResult:
     @functools.cached_property
     def residuals(self) -> Prediction:
         """Model minus data at the estimates; as large as the data."""
+        if self.stored_residuals is not None:
+            return self.stored_residuals
         return predictions(self.study, self.theta)
 
     @functools.cached_property
@@ -186,7 +232,7 @@ class FitResult:
             A `Table`: prints as text, shows as HTML in a notebook, `rows` are dictionaries. What
             the lanes of a joint fit share has one row.
         """
-        return Table(list(estimate_rows(self, profiles)))
+        return Table(estimate_rows(self, profiles))
 
     def to_dataset(self, profiles: Intervals | None = None) -> "xarray.Dataset":
         """The estimates with dimensions `lane` and `unknown`, as an xarray Dataset.
@@ -239,11 +285,7 @@ class FitResult:
             "cost": (per_lane, self.cost),
             "samples": (per_lane, self.samples),
             "rms": (("lane", "kind"), self.rms, {"unit": "N, mm"}),
-            "sigma": (
-                ("lane", "kind"),
-                np.where(np.isnan(self.rms), np.nan, self.sigma),
-                {"unit": "N, mm"},
-            ),
+            "sigma": (("lane", "kind"), self.observed_sigma, {"unit": "N, mm"}),
         }
         same = all(row == labels[0] for row in labels)
         coords = {

@@ -11,15 +11,14 @@ from typing import Any, Literal
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
+from jaxtrachea.files.table import Row, Table
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.profile import Profiles
 
-#: Cells of a row of a table, by column.
-Cells = Mapping[str, object]
-#: Title, head and rows of a table on the terminal.
-Table = tuple[str, list[str], list[list[str]]]
+#: Cells of a row of a table, by name.
+Cells = Row
 #: Where an analysis speaks, see `Analysis`.
 Place = Literal["estimates", "quality", "checks", "data", "design"]
 #: Called with (steps done since the last call, steps in all, 0 if unknown).
@@ -88,7 +87,7 @@ class Findings:
         return self.get("profiles")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Analysis:
     """An analysis of a fit; what it has nothing to say of is left at its default.
 
@@ -106,16 +105,20 @@ class Analysis:
         asked: whether it is asked for otherwise.
         commands: that it belongs to.
         refuse: raises `SpecError`, before anything is fitted, where it cannot be done.
-        tables: rows by name of a CSV file.
+        tables: by name of a CSV file.
         lane_cells: cells of summary.csv, for (found, lane).
         parameter_cells: cells of parameters.csv, for (found, lane, unknown).
-        datasets: writes into its group of results.h5; None: it has none.
+        datasets: arrays of `found` in its group of results.h5; none: it has no such group.
+        attributes: of this group, likewise.
+        meanings: enumeration of the codes in a dataset, by its name.
         place: of its section in report.md and of its tables on the terminal: `estimates`, before
             the quality of the fit; `quality`, with it; `checks`, after it; `data`, after what is
             used of the data; `design`: it belongs to that command.
-        section: paragraphs of the report.
+        table: for people, in the report under its title and on the terminal, for (found, lanes
+            that are listed); None: it has none.
+        section: paragraphs of the report, below its table.
         warning: paragraphs below the table of estimates.
-        shown: tables and sentences on the terminal, for (found, lanes that are listed).
+        shown: sentences on the terminal, below its table.
         figures: what draws each picture, by name of the file.
         poor: whether it came out so that the command ends with exit code 1.
     """
@@ -129,14 +132,17 @@ class Analysis:
     asked: Callable[[Request], bool] = lambda request: False
     commands: tuple[str, ...] = ("fit",)
     refuse: Callable[[Request], None] = lambda request: None
-    tables: Callable[[Any], Mapping[str, Iterable[Cells]]] = lambda found: {}
+    tables: Callable[[Any], Mapping[str, Table]] = lambda found: {}
     lane_cells: Callable[[Any, int], Cells] = lambda found, lane: {}
     parameter_cells: Callable[[Any, int, int], Cells] = lambda found, lane, i: {}
-    datasets: Callable[[Any, Any], None] | None = None
+    datasets: tuple[str, ...] = ()
+    attributes: tuple[str, ...] = ()
+    meanings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     place: Place = "checks"
+    table: Callable[[Any, list[int]], Table | None] = lambda found, lanes: None
     section: Callable[[Any], list[str]] = lambda found: []
     warning: Callable[[Any], list[str]] = lambda found: []
-    shown: Callable[[Any, list[int]], Iterable[Table | str]] = lambda found, lanes: ()
+    shown: Callable[[Any], Iterable[str]] = lambda found: ()
     figures: Callable[[Any], Mapping[str, Callable[[], Any]]] = lambda found: {}
     poor: Callable[[Any], bool] = lambda found: False
 
@@ -147,6 +153,18 @@ class Analysis:
             ValueError: with the places there are.
         """
         check_word("place", self.place, Place)
+
+    def report(self, found: Any, lanes: list[int]) -> list[str]:
+        """Paragraphs of the report: its table, where it has one, and its section."""
+        table = self.table(found, lanes)
+        above = [] if table is None else [f"## {table.title}", *table.paragraphs()]
+        return above + self.section(found)
+
+    def terminal(self, found: Any, lanes: list[int]) -> Iterator[Table | str]:
+        """Its table on the terminal, where it has one, and its sentences."""
+        table = self.table(found, lanes)
+        yield from () if table is None else [table]
+        yield from self.shown(found)
 
     def wanted(self, request: Request) -> bool:
         """Whether the request asks for it."""

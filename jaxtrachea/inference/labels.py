@@ -1,5 +1,7 @@
 """What lanes and unknowns are called, and what is said of them in a sentence."""
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
 import numpy as np
 
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
@@ -28,6 +30,22 @@ def lane_label(result: FitResult, lane: int) -> str:
     """Specimen of a lane, and its trial if it holds a single one."""
     specimen, trial = result.study.lane_name(lane)
     return specimen if trial == "(all)" else f"{specimen} {trial}"
+
+
+def unknown_rows(
+    result: FitResult,
+    lanes: Sequence[int],
+    cells: Callable[[int, int], Mapping[str, object]],
+) -> Iterator[dict[str, object]]:
+    """A row for each unknown of some lanes: whose, its estimate, and `cells` of (lane, unknown)."""
+    for lane in lanes:
+        for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
+            yield {
+                "specimen": lane_label(result, lane),
+                "parameter": f"{unknown_label(result, lane, i)} [{p.unit}]",
+                "value": float(result.value[lane, i]),
+                **cells(lane, i),
+            }
 
 
 def succeeded(result: FitResult, lane: int) -> bool:

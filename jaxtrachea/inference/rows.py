@@ -1,7 +1,5 @@
 """Which rows the tables of a fit have, and in which order."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from jaxtrachea.fitting.lane import forces, markers, peaks
@@ -56,11 +54,6 @@ def listed(result: FitResult, most: int = ONE_BY_ONE) -> list[int]:
     return lanes if result.lanes <= most else worst_first(result)[:most]
 
 
-def and_more(total: int, shown: int, file: str = "summary.csv") -> list[str]:
-    """What follows a table that does not hold all; nothing where it does."""
-    return [] if total <= shown else [f"Worst first; and {total - shown} more, see {file}"]
-
-
-def more_of(result: FitResult, shown: Sequence[int], file: str) -> list[str]:
-    """A paragraph that says how many lanes a table leaves out; none if it holds all."""
-    return [f"{text}." for text in and_more(result.lanes, len(shown), file)]
+def and_more(total: int, shown: int, file: str) -> str:
+    """What follows a table that does not hold all; "" where it does."""
+    return "" if total <= shown else f"Worst first; and {total - shown} more, see {file}"

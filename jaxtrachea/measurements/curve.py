@@ -125,15 +125,6 @@ class BadCurve:
         place = "" if self.message.startswith(self.source) else f"{self.source}: "
         return f"{self.kind}: {place}{self.message}; {self.cure}"
 
-    @property
-    def cells(self) -> list[str]:
-        """A row of the table of what could not be used, under `BAD_HEAD`."""
-        return [self.specimen, self.trial, self.kind, self.message, self.cure]
-
-
-#: Heads of a table of `BadCurve.cells`.
-BAD_HEAD = ["specimen", "trial", "kind", "what", "cure"]
-
 
 @dataclass(frozen=True, eq=False)
 class RawCurve:

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.files.atomic import write_whole
-from jaxtrachea.files.tables import quoted
+from jaxtrachea.files.table import quoted
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.observed import OBSERVED
 

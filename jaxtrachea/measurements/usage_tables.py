@@ -4,14 +4,21 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from hashlib import sha256
 
+from jaxtrachea.files.table import Column, Table
 from jaxtrachea.measurements.observed import FURTHER_FIELDS
-from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.measurements.usage import CAUSES
 
 #: Share of left-out samples from which a fit says so.
 CUT = 0.1
 #: Names in a sentence; the files hold all.
 _NAMES = 10
+_BAD = (*map(Column, ("specimen", "trial", "kind")), Column("what", "message"), Column("cure"))
+
+
+def bad_table(bad: Sequence[BadCurve]) -> Table:
+    """What could not be used, and why."""
+    return Table(map(vars, bad), _BAD, title="Curves that could not be used")
 
 
 def usage_rows(curves: Sequence[Curve]) -> Iterator[dict[str, object]]:

@@ -14,6 +14,7 @@ from jaxtrachea.fitting.model import columns_of
 from jaxtrachea.fitting.onset import onset_is_sought
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.refusals import Size, refusal
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.zeros import resolved
@@ -23,8 +24,8 @@ from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, force_and_slope
 from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import Source, source_of, value_of
-from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import FitStatus, PredictionStatus
 
 #: Standard deviations of the noise from which a force counts in the share that a band holds.
@@ -87,7 +88,7 @@ class Compared:
         return found
 
 
-def pressable(stored: StoredFit, curves: Sequence[Curve]) -> tuple[list[Curve], list[BadCurve]]:
+def pressable(stored: FitResult, curves: Sequence[Curve]) -> tuple[list[Curve], list[BadCurve]]:
     """Curves that the model of the fit can press, and the others with the reason."""
     good, bad = [], []
     model, parameters = stored.study.model, stored.study.parameters
@@ -104,7 +105,7 @@ def pressable(stored: StoredFit, curves: Sequence[Curve]) -> tuple[list[Curve], 
 
 
 def compare(
-    stored: StoredFit, curves: Sequence[Curve], *, as_specimen: str | None = None
+    stored: FitResult, curves: Sequence[Curve], *, as_specimen: str | None = None
 ) -> list[Compared]:
     """Predict measured curves.
 
@@ -119,7 +120,7 @@ def compare(
     """
     if not curves:
         return []
-    used = {(c.specimen, c.trial): c for c in stored.curves}
+    used = {(c.specimen, c.trial): c for c in pressed(stored).curves}
     fitted, (stored, taken) = stored, _with_zeros(stored, curves)
     sources, words = [], []
     for curve in curves:
@@ -132,7 +133,7 @@ def compare(
         sources.append(dataclasses.replace(source, trial=curve.trial, own=own))
         words.append(word)
     # The error between positions is that of the fit, whose unknowns these are.
-    stored.found.update(model_errors(fitted, [source.lane for source in sources]))
+    pressed(stored).errors.update(model_errors(fitted, [source.lane for source in sources]))
     sigmas = [_sigma(stored, c, source) for c, source in zip(curves, sources, strict=True)]
     rounded = zip(sources, measured_corners(stored, curves, sigmas), words, strict=True)
     sources = [
@@ -150,7 +151,7 @@ def compare(
     return [Compared(*row) for row in zip(curves, found, words, offsets, strict=True)]
 
 
-def _with_zeros(stored: StoredFit, curves: Sequence[Curve]) -> tuple[StoredFit, Taken]:
+def _with_zeros(stored: FitResult, curves: Sequence[Curve]) -> tuple[FitResult, Taken]:
     """The fit with columns for all zeros that are `auto` and that a curve's own record shows.
 
     Also such as no curve of the fit takes; and which of them each curve takes.
@@ -159,7 +160,7 @@ def _with_zeros(stored: StoredFit, curves: Sequence[Curve]) -> tuple[StoredFit, 
     held = [dataclasses.replace(p, fixed=True) if p.auto else p for p in study.parameters]
     if not any(p.auto for p in held):
         return stored, {}
-    if stored.reading.get("baseline") == "none":
+    if stored.origin.reading.get("baseline") == "none":
         held.append(dataclasses.replace(DEFAULTS["force_slope"], auto=False))
     own = resolved(held, curves, study.model.options)
     shown = {p.name for p in own.parameters if p.auto and not p.fixed}
@@ -168,7 +169,13 @@ def _with_zeros(stored: StoredFit, curves: Sequence[Curve]) -> tuple[StoredFit, 
              for p in study.parameters]  # fmt: skip
     table += [p for p in own.parameters if p.name not in known]
     model = dataclasses.replace(study.model, columns=columns_of(table))
-    study = dataclasses.replace(study, parameters=tuple(table), model=model)
+    more = [p.value for p in table[len(study.parameters) :]]
+    lanes, shape = study.lanes, (*study.lanes.s_c.shape, len(more))
+    lanes = lanes._replace(  # that no curve of the fit takes them
+        value=np.concatenate([lanes.value, np.broadcast_to(more, shape)], axis=2),
+        index=np.concatenate([lanes.index, np.full(shape, -1, np.int32)], axis=2),
+    )
+    study = dataclasses.replace(study, parameters=tuple(table), model=model, lanes=lanes)
     return dataclasses.replace(stored, study=study), own.taken
 
 
@@ -182,7 +189,7 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
     return "yes" if same else "changed"
 
 
-def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
+def _sigma(stored: FitResult, curve: Curve, source: Source) -> np.ndarray:
     """Noise of a curve's samples, N: its own where that of the fit was given, else the fit's.
 
     Without the share of the force that it may have beside it.
@@ -193,7 +200,7 @@ def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
 
 
 def with_own(
-    stored: StoredFit,
+    stored: FitResult,
     sources: Sequence[Source],
     curves: Sequence[Curve],
     sigmas: Sequence[np.ndarray],
@@ -222,7 +229,7 @@ def with_own(
 
 
 def measured_corners(
-    stored: StoredFit, curves: Sequence[Curve], sigmas: Sequence[np.ndarray]
+    stored: FitResult, curves: Sequence[Curve], sigmas: Sequence[np.ndarray]
 ) -> list[float]:
     """Rounded corner at the onset of new curves, mm, as the fit has its own; NaN without an onset.
 
@@ -256,7 +263,7 @@ def _apart(curve: Curve, i: int, sigma: np.ndarray | None) -> Curve:
     )
 
 
-def _own_study(stored: StoredFit, own, members) -> Study:
+def _own_study(stored: FitResult, own, members) -> Study:
     """One lane per curve, whose unknowns are the own columns."""
     study = stored.study
     names = {study.free[f].name for f in own}
@@ -287,7 +294,7 @@ def _steps(study: Study, own_study: Study, own) -> np.ndarray:
     return np.array([1.0 if q.scale == "log" else p.step / q.step for p, q in pairs])
 
 
-def _values(stored: StoredFit, source: Source) -> np.ndarray:
+def _values(stored: FitResult, source: Source) -> np.ndarray:
     """All parameters in their units, the free ones as estimated; (J,)."""
     value = source.value.copy()
     for f, j in enumerate(stored.study.free_columns):
@@ -296,7 +303,7 @@ def _values(stored: StoredFit, source: Source) -> np.ndarray:
     return value
 
 
-def _slopes(stored: StoredFit, own, sources, theta, own_study: Study) -> list[np.ndarray]:
+def _slopes(stored: FitResult, own, sources, theta, own_study: Study) -> list[np.ndarray]:
     """Derivative of the forces by all free columns, at the fitted own ones; (F, N) each.
 
     In the steps of the fit, as `theta` of the own columns.
@@ -326,7 +333,7 @@ class _Own(NamedTuple):
     sigma: np.ndarray
 
 
-def _merged(stored: StoredFit, source: Source, own: _Own) -> Source:
+def _merged(stored: FitResult, source: Source, own: _Own) -> Source:
     """The source with its own parameters and the covariance of all."""
     columns = list(own.columns)
     names = ", ".join(stored.study.free[f].name for f in columns)

@@ -24,16 +24,15 @@ from scipy.special import stdtrit
 
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.cost import weights
-from jaxtrachea.fitting.force_share import Levels, offsets, with_levels
 from jaxtrachea.fitting.lane import Lane, precisions
-from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual
-from jaxtrachea.fitting.study import Study, build_study
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.together import companions
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.results.stored import StoredFit
+from jaxtrachea.prediction.pressed import Pressed, pressed
 
 #: Positions from which the error between them is known well enough for a band.
 MIN_POSITIONS = 4
@@ -120,52 +119,23 @@ def weighted_rows(
     return r.value * root, r.jacobian * root[:, None], root * precisions(lane)
 
 
-def model_errors(stored: StoredFit, lanes: list[int]) -> dict[int, ModelError]:
+def model_errors(stored: FitResult, lanes: list[int]) -> dict[int, ModelError]:
     """Error between positions of some lanes of a fit, each computed once."""
-    kept: dict[int, ModelError] = stored.found
+    kept: dict[int, ModelError] = pressed(stored).errors
     missing = [lane for lane in dict.fromkeys(lanes) if lane >= 0 and lane not in kept]
     if missing:
-        study, theta, sigma, rows = _rebuilt(stored, missing)
+        study = stored.study.take(np.array(missing))
+        sigma = np.where(study.noise_given, 1.0, stored.observed_sigma[missing])
+        sigma = np.where(np.isfinite(sigma), sigma, 1.0)
         value, jacobian, root = map_lanes(
-            weighted_rows, study, theta, sigma, batch=study.batch_size(len(rows), 256)
-        )
-        for k, lane in enumerate(rows):
+            weighted_rows, study, stored.theta[missing], sigma,
+            batch=study.batch_size(len(missing), 256),
+        )  # fmt: skip
+        for k, lane in enumerate(missing):
             X = _over_unknowns(study, k, jacobian[k], stored.at_bound[lane])
             left = _LeftOut(value[k], X, root[k], study.lanes.force.shape[-1])
             kept[lane] = _of_lane(stored, lane, study.curves[k], left)
     return {lane: kept[lane] for lane in lanes if lane >= 0}
-
-
-def _rebuilt(
-    stored: StoredFit, chosen: list[int]
-) -> tuple[Study, Float[np.ndarray, "n P"], Float[np.ndarray, "n 2"], list[int]]:
-    """Lanes of the fit with their data, estimates, whitened sigma, and which lanes they are."""
-    study, given = stored.study, stored.study.noise_given
-    if study.curves:
-        rows, built = chosen, study.take(np.array(chosen))
-    else:
-        pairs = zip(stored.curves, stored.curve_lane.tolist(), strict=True)
-        own = [(c, lane) for c, lane in pairs if lane in set(chosen)]
-        known = given[0] and any(c.sigma is None for c, _ in own)
-        joints, share = study.marker_noise or (None, 0.0)
-        built = build_study(
-            [c for c, _ in own], study.model.geometry, study.model.options, study.parameters,
-            noise=Noise(float(stored.sigma[own[0][1], 0]) if known else None, joints, share),
-            weighting=Weighting(study.balance, study.model.loss, study.model.loss_scale),
-            joint=study.joint,
-        )  # fmt: skip
-        lane_of = {(c.specimen, c.trial): lane for c, lane in own}
-        rows = [lane_of[lane[0].specimen, lane[0].trial] for lane in built.curves]
-    steps = [1.0 if p.scale == "log" else q.step / p.step
-             for p, q in zip(built.parameters, study.parameters, strict=True)]  # fmt: skip
-    column = {p.name: step for p, step in zip(built.parameters, steps, strict=True)}
-    theta = stored.theta[rows][:, : built.size] * built.of_unknowns(lambda p: column[p.name], 1.0)
-    sigma = np.where(given, 1.0, stored.sigma[rows])
-    share = stored.force_share[rows]
-    if built.shares is None and share.any():
-        force = np.asarray(built.lanes.force) - offsets(built, theta)[..., None]
-        built = with_levels(built, Levels(sigma[:, 0], share), force)
-    return built, theta, np.where(np.isfinite(sigma), sigma, 1.0), rows
 
 
 def _over_unknowns(
@@ -236,35 +206,35 @@ class _LeftOut(NamedTuple):
         return _over(e, root), _over(variance, root**2)
 
 
-def _of_lane(stored: StoredFit, lane: int, curves: tuple[Curve, ...], left: _LeftOut) -> ModelError:
+def _of_lane(stored: FitResult, lane: int, curves: tuple[Curve, ...], left: _LeftOut) -> ModelError:
     """Every position of a lane left out in turn."""
-    together = stored.study.together or tuple(map(tuple, stored.reading.get("together") or ()))
+    fitted = pressed(stored)
     places: dict[object, list[int]] = {}
-    for curve, group in zip(curves, companions(curves, together), strict=True):
+    for curve, group in zip(curves, companions(curves, stored.study.together), strict=True):
         s = np.nan if curve.s_c is None else round(curve.s_c / SAME_PLACE)
         places.setdefault((curve.specimen, s, curve.phi_c, *curve.direction), []).extend(group)
-    pressed = np.array([c.s_c for c in curves if c.s_c is not None], float)
-    deepest = max(float(np.max(stored.above_touch(c)[0], initial=0)) for c in curves)
+    at = np.array([c.s_c for c in curves if c.s_c is not None], float)
+    deepest = max(float(np.max(fitted.above_touch(c)[0], initial=0)) for c in curves)
     grid = np.linspace(0, deepest, POINTS)
     squares = []
     for out in places.values():
         out = sorted(set(out))
         found = left.predicted(out) if len(out) < len(curves) else None
         if found is not None:
-            squares.append(_squares(stored, [curves[t] for t in out], *found, grid))
+            squares.append(_squares(fitted, [curves[t] for t in out], *found, grid))
     squares = [v for v in squares if np.isfinite(v).all()]
-    n, growth = len(squares), float(stored.growth[lane]) if stored.study.free else 1.0
+    n, growth = len(squares), float(stored.effective.growth[lane]) if stored.study.free else 1.0
     if n < MIN_POSITIONS or deepest <= 0:
-        return ModelError(grid, np.full(POINTS, np.nan), n, np.nan, growth, pressed)
+        return ModelError(grid, np.full(POINTS, np.nan), n, np.nan, growth, at)
     by_depth = np.mean(squares, axis=0)
-    sampled = np.concatenate([stored.above_touch(c)[0] for c in curves])
+    sampled = np.concatenate([fitted.above_touch(c)[0] for c in curves])
     pooled = np.mean(np.interp(sampled[sampled > 0], grid, by_depth))
     # Few positions tell the square at one depth badly, all depths together none of its growth.
     share = np.sqrt(np.maximum((pooled + np.maximum(by_depth, 0)) / 2, 0))
-    return ModelError(grid, share, n, float(stdtrit(n - 1, 0.975)), growth, pressed)
+    return ModelError(grid, share, n, float(stdtrit(n - 1, 0.975)), growth, at)
 
 
-def _squares(stored: StoredFit, curves, error, variance, grid) -> Float[np.ndarray, " points"]:
+def _squares(fitted: Pressed, curves, error, variance, grid) -> Float[np.ndarray, " points"]:
     """Square of the smooth error of one position over the force, at the depths `grid`.
 
     Less what the noise of the curve and in the parameters explains, so that it may be negative.
@@ -272,7 +242,7 @@ def _squares(stored: StoredFit, curves, error, variance, grid) -> Float[np.ndarr
     """
     out = []
     for curve, e, v in zip(curves, error, variance, strict=True):
-        depth, F = stored.above_touch(curve)
+        depth, F = fitted.above_touch(curve)
         e, v = e[: len(F)], v[: len(F)]
         seen = (depth > 0) & np.isfinite(e) & (F != 0)
         if not seen.any():

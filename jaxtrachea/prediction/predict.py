@@ -26,8 +26,8 @@ from jaxtrachea.mechanics.sections.press import tested_angle
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import Source, onset_of, slack_of, source_of, value_of
-from jaxtrachea.results.stored import StoredFit, from_result
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 #: Error of the linear band at its ends, in half-widths, from which it is called bent.
@@ -134,7 +134,7 @@ class CurvePrediction:
 
 
 def predict_sources(
-    stored: StoredFit,
+    stored: FitResult,
     sources: list[Source],
     s: list[float],
     displacements: list[np.ndarray],
@@ -209,7 +209,7 @@ def _widened(source: Source, error: ModelError | None) -> Source:
 
 
 def _with_misfit(
-    stored: StoredFit, source: Source, error: ModelError | None, found: CurvePrediction
+    stored: FitResult, source: Source, error: ModelError | None, found: CurvePrediction
 ) -> CurvePrediction:
     """The prediction with what the model misses, and why its bands are as wide as they are.
 
@@ -249,7 +249,7 @@ def _rounded(count: int, least: int) -> int:
     return max(least, 1 << (count - 1).bit_length())
 
 
-def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predicted, sigma):
+def _on_host(stored: FitResult, source: Source, where, displacement, part: Predicted, sigma):
     """One curve at `where` (s, angle, direction), cut to its length, with its status."""
     n = len(displacement)
     s, phi, direction = where
@@ -276,8 +276,9 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
     status, message = _verdict(source, value, se, presses, bend)
     if usable:
-        spans, angles = stored.spans[source.lane], stored.angles[source.lane]
-        tilts = stored.tilts[source.lane]
+        fitted = pressed(stored)
+        spans, angles = fitted.spans[source.lane], fitted.angles[source.lane]
+        tilts = fitted.tilts[source.lane]
         aside = (angles, phi, "phi"), (tilts, tilt_of(direction), "tilt")
         model, counted = stored.study.model, counted_from(stored.study.parameters)
         depth = depths(displacement, onset_of(stored, source), model.options)
@@ -311,7 +312,7 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
     )
 
 
-def _marker_sigma(stored: StoredFit, source: Source, displacement) -> np.ndarray:
+def _marker_sigma(stored: FitResult, source: Source, displacement) -> np.ndarray:
     """Standard deviation of a marker at each displacement, mm; NaN if the fit had none."""
     given = stored.study.marker_noise
     if given is None or np.isnan(source.sigma[1]):
@@ -388,7 +389,7 @@ def _verdict(source: Source, value: Response, se: Response, presses, bend: float
 
 
 def predict(
-    results: StoredFit | FitResult,
+    results: FitResult,
     *,
     s: float,
     displacement: ArrayLike | Sequence[float],
@@ -424,7 +425,6 @@ def predict(
         ValueError: a position outside the tube, a displacement that is no finite number, a specimen
             or trial that the fit does not have, one without an estimate; with the cure.
     """
-    results = from_result(results) if isinstance(results, FitResult) else results
     D = np.atleast_1d(np.asarray(displacement, np.float64))
     if D.ndim != 1 or not D.size or not np.isfinite(D).all():
         raise ValueError("displacement: expected a finite number or a vector of them, mm")
@@ -432,8 +432,8 @@ def predict(
     check_aside(results, phi, direction)
     if specimen is None:
         specimen = _only_specimen(results)
-    elif specimen not in results.specimens:
-        raise ValueError(unknown_name("specimen", specimen, results.specimens))
+    elif specimen not in (names := pressed(results).specimens):
+        raise ValueError(unknown_name("specimen", specimen, names))
     source = source_of(results, specimen, trial)
     if not source.status.predicts:
         raise ValueError(f"{specimen}: {source.message or source.status.message}")
@@ -441,7 +441,7 @@ def predict(
     return predict_sources(results, [source], [float(s)], [D], aside=[(float(phi), along)])[0]
 
 
-def check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) -> None:
+def check_aside(results: FitResult, phi: float, direction: tuple[float, float]) -> None:
     """Refuse a press that the model does not have.
 
     Raises:
@@ -471,7 +471,7 @@ def check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) 
         raise ValueError(f"direction is {direction}; expected a unit vector")
 
 
-def check_position(results: StoredFit, s: float) -> None:
+def check_position(results: FitResult, s: float) -> None:
     """Refuse a contact position that is not on the tube.
 
     Raises:
@@ -490,8 +490,8 @@ def unknown_name(kind: str, name: str, known) -> str:
     return f"{kind} {name!r} is not in this fit; expected one of {listed}"
 
 
-def _only_specimen(results: StoredFit) -> str:
-    names = results.specimens
+def _only_specimen(results: FitResult) -> str:
+    names = pressed(results).specimens
     shared = all(p.scope in ("shared", "trial") for p in results.study.free)
     if len(names) > 1 and not shared:
         raise ValueError(

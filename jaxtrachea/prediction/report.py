@@ -4,19 +4,42 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.files.tables import markdown_table, number
-from jaxtrachea.measurements.curve import BAD_HEAD, BadCurve
+from jaxtrachea.files.table import Column, Row, Table, ends
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.measurements.curve import BadCurve
+from jaxtrachea.measurements.usage_tables import bad_table
 from jaxtrachea.prediction.held_out import Compared
 from jaxtrachea.prediction.predict import CurvePrediction
-from jaxtrachea.results.stored import StoredFit
+from jaxtrachea.prediction.pressed import pressed
+from jaxtrachea.prediction.tables import band_rows
 from jaxtrachea.status import PredictionStatus
 
 #: Rows of a table; the files hold all.
 MANY = 12
-ERROR_HEAD = ["specimen", "trial", "s [mm]", "in fit", "n", "rms / peak", "worst / peak", "in band",
-              "outcome"]  # fmt: skip
-AT_HEAD = ["specimen", "trial", "s [mm]", "D [mm]", "force [N]", "95 % of the curve",
-           "95 % with noise", "outcome"]  # fmt: skip
+
+
+def _outcome(row: Row) -> str:
+    return str(row["status"]).replace("_", " ")
+
+
+ERRORS = (
+    *map(Column, ("specimen", "trial", "s [mm]")),
+    Column("in fit", "in_fit"),
+    Column("n", lambda row: row.get("samples", 0)),
+    *(Column(head, unit="%", digits=3) for head in ("rms / peak", "worst / peak")),
+    Column("in band", "coverage95", unit="%", digits=3),
+    Column("outcome", _outcome),
+)
+DEEPEST = (
+    Column("specimen"),
+    Column("trial", lambda row: row["trial"] or None),
+    Column("s [mm]"),
+    Column("D [mm]", "displacement [mm]"),
+    Column("force [N]", "predicted [N]"),
+    Column("95 % of the curve", ends("curve_low95 [N]", "curve_high95 [N]")),
+    Column("95 % with noise", ends("low95 [N]", "high95 [N]")),
+    Column("outcome", _outcome),
+)
 BANDS = (
     "Bands are 95 %: of the curve itself (covariance of the parameters, linear: the delta method), "
     "and of a new sample (with the noise as well). The covariance is widened where neighbouring "
@@ -29,69 +52,28 @@ BANDS = (
 )
 
 
-def error_table(rows: Sequence[dict[str, object]], of: str = "curve") -> list[list[str]]:
+def error_table(rows: Sequence[Row], of: str = "curve") -> Table:
     """Rows of errors.csv for people, worst first; curves without a prediction come first."""
     chosen = [row for row in rows if row["of"] == of]
 
     def badness(row):
-        share = row.get("rms / peak", "")
-        return np.inf if share == "" else share
+        share = row.get("rms / peak")
+        return np.inf if share is None else share
 
-    return [_error_cells(row) for row in sorted(chosen, key=badness, reverse=True)]
-
-
-def _error_cells(row: dict[str, object]) -> list[str]:
-    def share(name):
-        value = row.get(name, "")
-        return "–" if value == "" else f"{100 * float(str(value)):.3g} %"
-
-    s = row.get("s [mm]", "")
-    return [
-        str(row["specimen"]),
-        str(row["trial"]),
-        "–" if s == "" else f"{float(str(s)):.4g}",
-        str(row.get("in_fit", "–")),
-        str(row.get("samples", 0)),
-        share("rms / peak"),
-        share("worst / peak"),
-        share("coverage95"),
-        str(row["status"]).replace("_", " "),
-    ]
+    table = Table(sorted(chosen, key=badness, reverse=True), ERRORS)
+    return table.first(MANY, "and {} more, see errors.csv")
 
 
-def at_table(curves: Sequence[CurvePrediction]) -> list[list[str]]:
+def at_table(curves: Sequence[CurvePrediction]) -> Table:
     """Every curve at its deepest displacement, for people."""
-    rows = []
-    for p in curves:
-        i = int(np.argmax(np.abs(p.displacement)))
-
-        def pair(low, high, i=i):
-            return f"{number(float(low[i]))} … {number(float(high[i]))}"
-
-        rows.append(
-            [
-                p.specimen,
-                p.trial or "–",
-                "–" if np.isnan(p.s) else f"{p.s:.4g}",
-                f"{p.displacement[i]:.4g}",
-                number(float(p.force[i])),
-                pair(p.curve_low95, p.curve_high95),
-                pair(p.low95, p.high95),
-                p.status.name.lower().replace("_", " "),
-            ]
-        )
-    return rows
+    deepest = [int(np.argmax(np.abs(p.displacement))) for p in curves]
+    rows = [list(band_rows(p, [i]))[0] for p, i in zip(curves, deepest, strict=True)]
+    return Table(rows, DEEPEST).first(MANY, "and {} more, see bands.csv")
 
 
-def shortened(rows: list[list[str]], file: str) -> tuple[list[list[str]], str]:
-    """The first rows of a table, and how many are not shown."""
-    left = len(rows) - MANY
-    return rows[:MANY], f"and {left} more, see {file}" if left > 0 else ""
-
-
-def _table(head, rows, file: str) -> str:
-    shown, more = shortened(rows, file)
-    return "\n\n".join(filter(None, [markdown_table(head, shown), more and f"... {more}."]))
+def _table(table: Table) -> str:
+    more = f"... {table.more}." if table.more else ""
+    return "\n\n".join(filter(None, [table.markdown(), more]))
 
 
 def outcomes(predictions: Sequence[CurvePrediction]) -> list[str]:
@@ -108,24 +90,25 @@ def outcomes(predictions: Sequence[CurvePrediction]) -> list[str]:
     return lines
 
 
-def _origin(stored: StoredFit, digest: str) -> str:
-    names = ", ".join(list(stored.files)[:8]) + (", ..." if len(stored.files) > 8 else "")
+def _origin(stored: FitResult, digest: str) -> str:
+    files, fitted = list(stored.origin.files), pressed(stored)
+    names = ", ".join(files[:8]) + (", ..." if len(files) > 8 else "")
     free = ", ".join(p.name for p in stored.study.free) or "nothing"
     return (
-        f"From `{stored.path.name}` (SHA-256 {digest[:16]}...): {free} fitted to "
-        f"{len(stored.curves)} curves of {len(stored.specimens)} specimen(s)"
+        f"From `{stored.origin.path.name}` (SHA-256 {digest[:16]}...): {free} fitted to "
+        f"{len(fitted.curves)} curves of {len(fitted.specimens)} specimen(s)"
         f"{f' in {names}' if names else ''}."
     )
 
 
-def report_at(stored: StoredFit, digest: str, curves: Sequence[CurvePrediction]) -> str:
+def report_at(stored: FitResult, digest: str, curves: Sequence[CurvePrediction]) -> str:
     """report.md of predictions at chosen positions."""
     parts = [
         "# Predictions",
         _origin(stored, digest),
         "\n".join(f"- {line}." for line in outcomes(curves)),
         "## At the deepest displacement of each curve",
-        _table(AT_HEAD, at_table(curves), "bands.csv"),
+        _table(at_table(curves)),
         BANDS,
         "![predictions](predictions.png)",
     ]
@@ -133,11 +116,11 @@ def report_at(stored: StoredFit, digest: str, curves: Sequence[CurvePrediction])
 
 
 def report_data(
-    stored: StoredFit,
+    stored: FitResult,
     digest: str,
     compared: Sequence[Compared],
     bad: Sequence[BadCurve],
-    rows: Sequence[dict[str, object]],
+    rows: Sequence[Row],
     notes: Sequence[str],
 ) -> str:
     """report.md of predictions of measured curves."""
@@ -150,16 +133,17 @@ def report_data(
             "residual, not a prediction."
         )
     parts += [f"{note}." for note in notes]
-    parts += ["## Curves, worst first", _table(ERROR_HEAD, error_table(rows), "errors.csv")]
+    parts += ["## Curves, worst first", _table(error_table(rows))]
     positions = error_table(rows, "position")
     if positions:
-        parts += ["## Contact positions, worst first", _table(ERROR_HEAD, positions, "errors.csv")]
+        parts += ["## Contact positions, worst first", _table(positions)]
     parts += [
         "rms and worst: predicted minus measured force over the largest measured force; in band: "
         "share of samples with force (above twice the noise) in the 95 % band with noise. " + BANDS,
     ]
     parts += ["![curves](curves.png)", "![measured against predicted](measured_predicted.png)"]
     if bad:
-        cells = [b.cells for b in bad]
-        parts += ["## Curves that could not be used", _table(BAD_HEAD, cells, "errors.csv")]
+        table = bad_table(bad)
+        cut = table.first(MANY, "and {} more, see errors.csv")
+        parts += [f"## {table.title}", _table(cut)]
     return "\n\n".join(parts) + "\n"

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 
 from jaxtrachea.fitting.covariance import SINGULAR
-from jaxtrachea.results.stored import StoredFit
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.status import FitStatus, PredictionStatus
 
 #: Parameters of a measurement, not of the specimen: zero where no measurement is meant, whatever
@@ -53,7 +54,7 @@ class Source:
 
 
 def source_of(
-    stored: StoredFit,
+    stored: FitResult,
     specimen: str,
     trial: str | None = None,
     *,
@@ -78,7 +79,7 @@ def source_of(
         return _none(stored, specimen, trial, PredictionStatus.UNKNOWN_SPECIMEN, note)
     lane = _lane(stored, used, trial)
     if lane is None:
-        known = [c.trial for c in stored.curves if c.specimen == used]
+        known = [c.trial for c in pressed(stored).curves if c.specimen == used]
         text = f"trial {trial!r} is not in this fit; expected one of " + ", ".join(
             map(repr, known[:12])
         )
@@ -98,7 +99,7 @@ def source_of(
     return _from_first_touch(stored, taken) if new else taken
 
 
-def _counted(stored: StoredFit, trial: str | None) -> str:
+def _counted(stored: FitResult, trial: str | None) -> str:
     """What displacement and force are counted from, in words; "" where records have no zero."""
     zeros = [p for p in stored.study.parameters if p.name in OF_MEASUREMENT]
     if all(p.fixed and p.value == 0 for p in zeros):
@@ -108,7 +109,7 @@ def _counted(stored: StoredFit, trial: str | None) -> str:
     return f"D and force as trial {trial!r} records them"
 
 
-def _from_first_touch(stored: StoredFit, source: Source) -> Source:
+def _from_first_touch(stored: FitResult, source: Source) -> Source:
     """The source with no onset and no offset: a press that nobody records."""
     study = stored.study
     value = [0.0 if p.name in OF_MEASUREMENT else v
@@ -118,15 +119,16 @@ def _from_first_touch(stored: StoredFit, source: Source) -> Source:
     return dataclasses.replace(source, value=np.array(value), free=np.array(free))
 
 
-def _corner(stored: StoredFit, specimen: str, trial: str | None) -> float:
+def _corner(stored: FitResult, specimen: str, trial: str | None) -> float:
     """Rounded corner that the fit used for this trial; NaN for a new one."""
-    pairs = zip(stored.curves, stored.blend.tolist(), strict=True)
+    fitted = pressed(stored)
+    pairs = zip(fitted.curves, fitted.blend.tolist(), strict=True)
     return next((b for c, b in pairs if (c.specimen, c.trial) == (specimen, trial)), np.nan)
 
 
-def _whose(stored: StoredFit, specimen: str, as_specimen: str | None) -> tuple[str | None, str]:
+def _whose(stored: FitResult, specimen: str, as_specimen: str | None) -> tuple[str | None, str]:
     """Specimen of the fit that stands for this one, and what is to be said of it."""
-    names = stored.specimens
+    names = pressed(stored).specimens
     if specimen in names:
         return specimen, ""
     if as_specimen is not None:
@@ -142,9 +144,10 @@ def _whose(stored: StoredFit, specimen: str, as_specimen: str | None) -> tuple[s
     )
 
 
-def _lane(stored: StoredFit, specimen: str, trial: str | None) -> int | None:
+def _lane(stored: FitResult, specimen: str, trial: str | None) -> int | None:
     """Lane that holds this specimen, and trial if one is named; one with an estimate if any has."""
-    pairs = zip(stored.curves, stored.curve_lane.tolist(), strict=True)
+    fitted = pressed(stored)
+    pairs = zip(fitted.curves, fitted.lane.tolist(), strict=True)
     lanes = [
         k for c, k in pairs if c.specimen == specimen and (trial is None or c.trial == trial)
     ]  # fmt: skip
@@ -154,7 +157,7 @@ def _lane(stored: StoredFit, specimen: str, trial: str | None) -> int | None:
     return (good or lanes)[0]
 
 
-def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None, without):
+def _columns(stored: FitResult, lane: int, specimen: str, trial: str | None, without):
     """Unknown that every free column reads, -1 for those that the fit does not have; and these.
 
     `without`: names of columns that count as such.
@@ -175,7 +178,7 @@ def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None, wit
     return np.array(index, int), tuple(own)
 
 
-def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str) -> Source:
+def _taken(stored: FitResult, specimen, trial, lane: int, index, own, note: str) -> Source:
     """The rows of the fit in the order of the free columns."""
     known = index >= 0
     pick = np.where(known, index, 0)
@@ -186,8 +189,8 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
     said = [note] if note else []
     status = PredictionStatus.OK
     if known.any():
-        covariance = np.where(both, stored.covariance[lane][np.ix_(pick, pick)], 0.0)
-        null_space = np.where(known, stored.null_space[lane][:, pick], 0.0)
+        covariance = np.where(both, stored.uncertainty.covariance[lane][np.ix_(pick, pick)], 0.0)
+        null_space = np.where(known, stored.uncertainty.null_space[lane][:, pick], 0.0)
         held = [p.name for p, k, i in zip(stored.study.free, known, pick, strict=True)
                 if k and stored.at_bound[lane, i]]  # fmt: skip
         if held:
@@ -202,19 +205,19 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
         covariance=covariance,
         null_space=null_space,
         half_width=np.asarray(stored.half_width[lane]),
-        sigma=stored.sigma[lane],
+        sigma=stored.observed_sigma[lane],
         own=own,
         status=status,
         message="; ".join(said),
     )
 
 
-def onset_of(stored: StoredFit, source: Source) -> float:
+def onset_of(stored: FitResult, source: Source) -> float:
     """Displacement of a curve at first touch, mm, as it is predicted."""
     return value_of(stored, source, "onset")
 
 
-def value_of(stored: StoredFit, source: Source, name: str) -> float:
+def value_of(stored: FitResult, source: Source, name: str) -> float:
     """A parameter of a curve as it is predicted, in its unit."""
     for p, scaled in zip(stored.study.free, source.free, strict=True):
         if p.name == name:
@@ -222,7 +225,7 @@ def value_of(stored: StoredFit, source: Source, name: str) -> float:
     return float(source.value[[p.name for p in stored.study.parameters].index(name)])
 
 
-def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message: str) -> Source:
+def _none(stored: FitResult, specimen, trial, status: PredictionStatus, message: str) -> Source:
     """No parameters, and why; arrays of the usual shapes, so that one program serves all."""
     F, J = len(stored.study.free), len(stored.study.parameters)
     nan = np.full(F, np.nan)
@@ -243,7 +246,7 @@ def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message:
 
 
 def slack_of(
-    stored: StoredFit,
+    stored: FitResult,
     source: Source,
     where: tuple[float, float, tuple[float, float]],
     displacement: np.ndarray,
@@ -252,10 +255,10 @@ def slack_of(
 
     `where`: position, mm, angle, rad, and direction.
     """
-    free = stored.study.free
+    free, fitted = stored.study.free, pressed(stored)
     out = np.zeros((len(displacement), len(free)))
-    own = np.flatnonzero(stored.curve_lane == source.lane)
-    curves = [stored.curves[i] for i in own]
+    own = np.flatnonzero(fitted.lane == source.lane)
+    curves = [fitted.curves[i] for i in own]
 
     def place(c):
         return [np.nan if c.s_c is None else c.s_c, c.phi_c, *c.direction]
@@ -266,14 +269,14 @@ def slack_of(
     def is_here(c):
         return np.allclose(place(c), at, rtol=0, atol=1e-9, equal_nan=True)
 
-    here = [i for i in own if is_here(stored.curves[i])]
+    here = [i for i in own if is_here(fitted.curves[i])]
     if not here or not source.null_space.any():
         return out
     # Of a scaled coordinate; an onset's steps are as large as the presses.
     size = [1.0 if p.scale == "log" or p.name in OF_MEASUREMENT else max(abs(v), 1e-3)
             for p, v in zip(free, source.free, strict=True)]  # fmt: skip
     samples = sum(len(c.force) for c in curves)
-    reached = [stored.curves[i].displacement - stored.first_touch[i] for i in here]
+    reached = [fitted.curves[i].displacement - fitted.first_touch[i] for i in here]
     low, high = (f([f(d) for d in reached]) for f in (np.min, np.max))
     depth = displacement - onset_of(stored, source)
     out[(depth >= low - 1e-9) & (depth <= high + 1e-9)] = size

@@ -19,8 +19,8 @@ COLUMNS = (
 
 
 def _cell(value: float) -> object:
-    """A number for a CSV file; empty for NaN."""
-    return "" if np.isnan(value) else float(value)
+    """A number; None for NaN."""
+    return None if np.isnan(value) else float(value)
 
 
 def _place(p: CurvePrediction, i: int) -> Row:
@@ -65,8 +65,8 @@ def _side_cells(p: CurvePrediction, i: int, measured: np.ndarray | None) -> Row:
     return dict(zip(names, map(_cell, values), strict=True))
 
 
-def band_rows(p: CurvePrediction) -> Iterator[Row]:
-    """One row per displacement: both bands, standard errors, statuses."""
+def band_rows(p: CurvePrediction, at: Sequence[int] | None = None) -> Iterator[Row]:
+    """One row per displacement (of `at`, if given): both bands, standard errors, statuses."""
     columns = {
         "predicted [N]": p.force,
         "se [N]": p.se,
@@ -77,11 +77,11 @@ def band_rows(p: CurvePrediction) -> Iterator[Row]:
         "sigma [N]": p.sigma,
         "model_se [N]": np.zeros_like(p.force) + p.model_se,
     }
-    for i in range(len(p.displacement)):
+    for i in range(len(p.displacement)) if at is None else at:
         cells: Row = {name: _cell(float(v[i])) for name, v in columns.items()}
         press = PressStatus(int(p.press_status[i])) if p.status.predicts else None
         words = {
-            "press": "" if press is None else press.name.lower(),
+            "press": None if press is None else press.name.lower(),
             "status": p.status.name.lower(),
             "message": p.message,
         }
@@ -156,6 +156,7 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
     markers = [c.joint_residual(tool_radius, rings).ravel() for c in group]
     marker = np.concatenate(markers)
     marker = marker[np.isfinite(marker)]
+    off_most = float(marker[np.argmax(np.abs(marker))]) if len(marker) else np.nan
     known = np.isfinite(residual)
     peak = float(np.max(np.abs(force)))
     rms = worst = at = covered = np.nan
@@ -172,7 +173,7 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
         "of": of,
         "specimen": first.curve.specimen if one else "(all)",
         "trial": first.curve.trial if one else "(all)",
-        "s [mm]": _cell(s[0]) if of != "all" else "",
+        "s [mm]": _cell(s[0]) if of != "all" else None,
         "in_fit": first.in_fit if one else f"{used} of {len(group)}",
         "curves": len(group),
         "samples": int(known.sum()),
@@ -183,8 +184,8 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
         "rms / peak": _cell(rms / peak if peak > 0 else np.nan),
         "worst / peak": _cell(abs(worst) / peak if peak > 0 else np.nan),
         "coverage95": _cell(covered),
-        "rms joints [mm]": float(np.sqrt(np.mean(marker**2))) if len(marker) else "",
-        "worst joint [mm]": _cell(float(marker[np.argmax(np.abs(marker))])) if len(marker) else "",
+        "rms joints [mm]": float(np.sqrt(np.mean(marker**2))) if len(marker) else None,
+        "worst joint [mm]": _cell(off_most),
         "status": status.name.lower(),
         "message": first.prediction.message if one else status.message,
     } | _side_errors(of, group)  # fmt: skip
@@ -199,7 +200,7 @@ def _side_errors(of: str, group: Sequence[Compared]) -> Row:
     first = group[0].prediction
     phi, tilt = np.degrees([first.phi, tilt_of(first.direction)]).tolist()
     return {
-        "phi [deg]": phi if of != "all" else "",
-        "tilt [deg]": tilt if of != "all" else "",
-        "rms side [N]": float(np.sqrt(np.mean(off**2))) if len(off) else "",
+        "phi [deg]": phi if of != "all" else None,
+        "tilt [deg]": tilt if of != "all" else None,
+        "rms side [N]": float(np.sqrt(np.mean(off**2))) if len(off) else None,
     }

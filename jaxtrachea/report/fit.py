@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.files.tables import markdown_table
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.labels import (
@@ -15,16 +14,10 @@ from jaxtrachea.inference.labels import (
     verdict_sentence,
 )
 from jaxtrachea.inference.residuals import worst
-from jaxtrachea.inference.rows import ONE_BY_ONE, listed, more_of
-from jaxtrachea.measurements.curve import BAD_HEAD, BadCurve
-from jaxtrachea.report.tables import (
-    ESTIMATE_HEAD,
-    QUALITY_HEAD,
-    SPREAD_HEAD,
-    estimate_rows,
-    quality_rows,
-    spread_rows,
-)
+from jaxtrachea.inference.rows import ONE_BY_ONE, and_more, listed
+from jaxtrachea.measurements.curve import BadCurve
+from jaxtrachea.measurements.usage_tables import bad_table
+from jaxtrachea.report.tables import estimate_table, quality_table, spread_table
 
 
 def report_text(
@@ -67,30 +60,33 @@ def report_text(
     names |= {"correlation": "correlation"} if result.study.free else {}
     parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:
-        rows = [b.cells for b in bad]
-        parts += ["## Curves that could not be used", markdown_table(BAD_HEAD, rows)]
+        table = bad_table(bad)
+        parts += [f"## {table.title}", *table.paragraphs()]
     return "\n\n".join(parts) + "\n"
 
 
 def _sections(findings: Findings, place: str) -> list[str]:
     """Sections of the analyses that have theirs at this place."""
-    return [text for analysis, found in findings.at(place) for text in analysis.section(found)]
+    lanes = listed(findings.result)
+    return [
+        text for analysis, found in findings.at(place) for text in analysis.report(found, lanes)
+    ]
 
 
 def _estimates(findings: Findings) -> list[str]:
     """Values with their errors, and what the data leave open."""
     result, profiles = findings.result, findings.profiles
     shown = listed(result)
-    rows = estimate_rows(result, shown, profiles)
-    tables = [markdown_table(ESTIMATE_HEAD, rows), *more_of(result, shown, "parameters.csv")]
+    tables = estimate_table(result, shown, profiles).paragraphs()
     if result.lanes > len(shown):
-        tables = [markdown_table(SPREAD_HEAD, spread_rows(result, profiles)), *tables]
+        tables = [spread_table(result, profiles).markdown(), *tables]
     if not result.study.free:
         tables = [f"None: {NOTHING_FITTED}."]
     fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.study.parameters if p.fixed]
     if not result.study.free:
         return ["## Estimates", *tables, f"Fixed: {', '.join(fixed)}."]
     flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
+    more = and_more(result.lanes, len(shown), "summary.csv")
     return [
         "## Estimates",
         *tables,
@@ -98,7 +94,7 @@ def _estimates(findings: Findings) -> list[str]:
         f"Fixed: {', '.join(fixed) or 'none'}.",
         "## What the data determine",
         "\n".join(flat),
-        *more_of(result, shown, "summary.csv"),
+        *([f"{more}."] if more else []),
         "Identifiable: relative error up to 10 %; weak: up to 50 %; practically non-identifiable: "
         "more, or open on a side (limited by a bound, where that is said); structurally "
         "non-identifiable: no data from these contact points can tell, however exact; "
@@ -115,13 +111,12 @@ def _estimates(findings: Findings) -> list[str]:
 def _quality(result: FitResult, failed: list[int]) -> list[str]:
     """Lanes one by one: of many those that failed (50 at most), then the worst."""
     shown = listed(result, max(ONE_BY_ONE, min(len(failed), 50)))
-    table = markdown_table(QUALITY_HEAD, quality_rows(result, shown))
     legend = (
         "iter: iterations; n: samples; rms F: root mean square residual of the force; of peak: the "
         "same over the largest force; rms joints: of the markers; cond: condition number of the "
         "Jacobian; AICc: to compare models of the same data."
     )
-    return [table, *more_of(result, shown, "summary.csv"), legend]
+    return [*quality_table(result, shown).paragraphs(), legend]
 
 
 def _bounds(result: FitResult) -> list[str]:

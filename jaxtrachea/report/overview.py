@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator
 
-from jaxtrachea.inference.analysis import Findings, Table
+from jaxtrachea.files.table import Table
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.labels import lane_label, outcome, verdict_sentence
-from jaxtrachea.inference.rows import and_more, listed
+from jaxtrachea.inference.rows import listed
 from jaxtrachea.measurements.usage_tables import sentences
 from jaxtrachea.report import tables
 from jaxtrachea.trials.repeats import trial_sentences
@@ -22,20 +23,19 @@ def overview(findings: Findings) -> Iterator[Table | str]:
     if not result.study.free:
         yield f"{result.lanes} fits: {verdict_sentence(result, 0)}"
     elif cut:
-        yield "Estimates over fits", tables.SPREAD_HEAD, tables.spread_rows(result, profiles)
+        yield tables.spread_table(result, profiles)
     else:
-        yield "Estimates", tables.ESTIMATE_HEAD, tables.estimate_rows(result, lanes, profiles)
+        yield tables.estimate_table(result, lanes, profiles)
     for analysis, found in findings.at("quality"):
-        yield from analysis.shown(found, lanes)
+        yield from analysis.terminal(found, lanes)
     for analysis, found in findings.found:
         yield from (text.replace("**", "") for text in analysis.warning(found))
     for analysis, found in findings.at("estimates"):
-        yield from analysis.shown(found, lanes)
-    yield "Quality", tables.QUALITY_HEAD, tables.quality_rows(result, lanes)
-    yield from and_more(result.lanes, len(lanes), "summary.csv")
+        yield from analysis.terminal(found, lanes)
+    yield tables.quality_table(result, lanes)
     for analysis, found in findings.found:
         if analysis.place not in ("estimates", "quality"):
-            yield from analysis.shown(found, lanes)
+            yield from analysis.terminal(found, lanes)
     for lane in lanes if result.study.free and not cut else ():
         yield f"{lane_label(result, lane)}: {verdict_sentence(result, lane, profiles)}"
     if cut and result.study.free:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.files.tables import interval, number
+from jaxtrachea.files.table import Column, Interval, Table
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.result import (
     DETERMINED,
@@ -16,29 +16,34 @@ from jaxtrachea.fitting.result import (
 )
 from jaxtrachea.inference.labels import lane_label, peak_force, succeeded
 from jaxtrachea.inference.profile import Profiles
+from jaxtrachea.inference.rows import and_more
 from jaxtrachea.status import FitStatus
 
-ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval", "verdict"]
-SPREAD_HEAD = ["parameter", "determined", "median", "quartiles", "error", "identifiable"]
-QUALITY_HEAD = [
-    "specimen",
-    "outcome",
-    "iter",
-    "n",
-    "rms F",
-    "of peak",
-    "rms joints",
-    "cond",
-    "AICc",
-]
+ESTIMATES = (
+    *map(Column, ("specimen", "parameter", "value")),
+    Column("std. error", digits=2),
+    *map(Column, ("95 % interval", "verdict")),
+)
+SPREAD = (
+    *map(Column, ("parameter", "determined", "median", "quartiles", "error")),
+    Column("identifiable", unit="%", decimals=0),
+)
+QUALITY = (
+    *map(Column, ("specimen", "outcome", "iter", "n")),
+    Column("rms F", unit="N", digits=3),
+    Column("of peak", unit="%", digits=2),
+    Column("rms joints", unit="mm", digits=3),
+    Column("cond", digits=2),
+    Column("AICc", digits=5),
+)
 
 
-def estimate_rows(
+def estimate_table(
     result: FitResult,
     lanes: Sequence[int],
     profiles: Profiles | None = None,
-) -> list[list[str]]:
-    """Lane, parameter, value, standard error, 95 % interval, verdict."""
+) -> Table:
+    """Value, standard error, 95 % interval and verdict of every unknown of some lanes."""
     rows = []
     for lane in lanes:
         for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
@@ -46,19 +51,20 @@ def estimate_rows(
                 continue
             judged = judgement(result, lane, i, profiles)
             rows.append(
-                [
-                    lane_label(result, lane) if is_own(result, lane, i) else "(all)",
-                    f"{unknown_label(result, lane, i)} [{p.unit}]",
-                    number(result.value[lane, i]),
-                    number(judged.standard_error, 2),
-                    interval(judged.low, judged.high, log=p.scale == "log"),
-                    judged.verdict,
-                ]
+                {
+                    "specimen": lane_label(result, lane) if is_own(result, lane, i) else "(all)",
+                    "parameter": f"{unknown_label(result, lane, i)} [{p.unit}]",
+                    "value": float(result.value[lane, i]),
+                    "std. error": judged.standard_error,
+                    "95 % interval": Interval(judged.low, judged.high, p.scale == "log"),
+                    "verdict": judged.verdict,
+                }
             )
-    return rows
+    more = and_more(result.lanes, len(lanes), "parameters.csv")
+    return Table(rows, ESTIMATES, title="Estimates", more=more)
 
 
-def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
+def spread_table(result: FitResult, profiles: Profiles | None = None) -> Table:
     """Parameter, estimates determined of all, their median, quartiles and median error, and share.
 
     Determined: identifiable or weak; a median of others would say nothing.
@@ -80,35 +86,36 @@ def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[lis
     rows = []
     for name, entries in columns.items():
         told = np.array([e[:2] for e in entries if e[2] in DETERMINED]).reshape(-1, 2)
-        count = f"{len(told)} of {len(entries)}"
-        if not len(told):
-            rows.append([name, count, "–", "–", "–", "0 %"])
-            continue
-        low, mid, high = np.quantile(told[:, 0], [0.25, 0.5, 0.75])
-        middle, unit = float(np.median(told[:, 1])), units.get(name)
-        error = f"{middle:.2g} {unit}" if unit else f"{100 * middle:.2g} %"
-        share = f"{100 * np.mean([e[2] == 'identifiable' for e in entries]):.0f} %"
-        rows.append([name, count, number(mid), f"{number(low)} … {number(high)}", error, share])
-    return rows
+        row: dict[str, object] = {"parameter": name, "determined": f"{len(told)} of {len(entries)}"}
+        row["identifiable"] = float(np.mean([e[2] == "identifiable" for e in entries]))
+        if len(told):
+            low, mid, high = map(float, np.quantile(told[:, 0], [0.25, 0.5, 0.75]))
+            middle, unit = float(np.median(told[:, 1])), units.get(name)
+            row |= {"median": mid, "quartiles": (low, high)}
+            row["error"] = f"{middle:.2g} {unit}" if unit else f"{100 * middle:.2g} %"
+        rows.append(row)
+    return Table(rows, SPREAD, title="Estimates over fits")
 
 
-def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
-    """Lane, status, iterations, samples, rms residuals, condition number."""
+def quality_table(result: FitResult, lanes: Sequence[int]) -> Table:
+    """Status, iterations, samples, rms residuals, condition number of some lanes."""
     rows = []
     for lane in lanes:
         peak = peak_force(result, lane)
         status = FitStatus(int(result.status[lane]))
+        force, joints = map(float, result.rms[lane])
         rows.append(
-            [
-                lane_label(result, lane),
-                status.name.lower().replace("_", " "),
-                str(int(result.iterations[lane])),
-                str(int(result.samples[lane])),
-                f"{number(result.rms[lane, 0], 3)} N",
-                f"{100 * result.rms[lane, 0] / peak:.2g} %" if peak > 0 else "–",
-                f"{number(result.rms[lane, 1], 3)} mm" if np.isfinite(result.rms[lane, 1]) else "–",
-                number(float(result.uncertainty.condition[lane]), 2),
-                number(float(result.criteria.AICc[lane]), 5),
-            ]
+            {
+                "specimen": lane_label(result, lane),
+                "outcome": status.name.lower().replace("_", " "),
+                "iter": int(result.iterations[lane]),
+                "n": int(result.samples[lane]),
+                "rms F": force,
+                "of peak": force / peak if peak > 0 else None,
+                "rms joints": joints if np.isfinite(joints) else None,
+                "cond": float(result.uncertainty.condition[lane]),
+                "AICc": float(result.criteria.AICc[lane]),
+            }
         )
-    return rows
+    more = and_more(result.lanes, len(lanes), "summary.csv")
+    return Table(rows, QUALITY, title="Quality", more=more)

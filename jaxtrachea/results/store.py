@@ -1,6 +1,6 @@
-"""The groups of results.h5 that let a fit predict by itself: model, estimates, data as used.
+"""The groups of results.h5 that hold the study of a fit: model, lanes, data as used.
 
-Numbers and JSON (as bytes) only; `stored` reads them back.
+Numbers and JSON (as bytes) only; `read` makes the study of them again.
 """
 
 import dataclasses
@@ -12,13 +12,18 @@ from typing import Any
 import h5py
 import numpy as np
 
-from jaxtrachea.fitting.lane import markers
+from jaxtrachea.fitting.lane import FORCES, MARKERS, markers
 from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.readers.hdf5_values import numeric
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Arrays of the tube.
 GEOMETRY = tuple(f.name for f in dataclasses.fields(Geometry))
+#: Arrays of the lanes that follow from the data, and those that have a row for each sample.
+OBSERVED = ("displacement", *(name for name, _ in FORCES + MARKERS))
+BY_SAMPLE = (*(name for _, name in FORCES + MARKERS), "shares_plain")
 #: Pieces of a column that are tried, rows of each, and the part that gzip must leave at most.
 PIECES, ROWS, WORTH = 16, 1024, 0.7
 
@@ -26,7 +31,7 @@ PIECES, ROWS, WORTH = 16, 1024, 0.7
 def write(
     file: h5py.File, result: FitResult, files: Mapping[str, str], reading: Mapping[str, Any]
 ) -> None:
-    """Add the groups `model` and `data` to results.h5.
+    """Add the groups `model`, `study` and `data` to results.h5.
 
     Args:
         file: open for writing.
@@ -47,24 +52,52 @@ def write(
             "lanes": [study.lane_name(lane) for lane in range(result.lanes)],
             "loss": study.model.loss,
             "loss_scale": study.model.loss_scale,
+            "common": study.model.common,
             "noise_given": study.noise_given,
             "balance": study.balance,
             "marker_noise": study.marker_noise,
             "joint": study.joint,
+            "together": study.together,
+            "force_share": study.force_share,
             "reading": dict(reading),
             "units": {"length": "mm", "force": "N", "angle": "rad"},
         },
     )
     for name in GEOMETRY:
         group.create_dataset(name, data=np.asarray(getattr(study.model.geometry, name), np.float64))
+    _write_lanes(file.create_group("study"), study)
     _write_data(file.create_group("data"), result, files)
+
+
+def _write_lanes(group: h5py.Group, study: Study) -> None:
+    """What of the lanes does not follow from the curves; samples end to end."""
+    arrays = study.lanes._asdict() | {
+        "change_points": study.change_points,
+        "record_zeros": study.record_zeros,
+    }
+    if study.shares is not None:
+        arrays |= {f"shares_{name}": v for name, v in study.shares._asdict().items()}
+    for name, values in arrays.items():
+        if values is None or name in OBSERVED:
+            continue
+        values = np.asarray(values)
+        if name in BY_SAMPLE:
+            values = np.concatenate(
+                [values[k, t, : len(c.force)] for k, t, c in placed(study)]
+            )  # fmt: skip
+        group.create_dataset(name, data=values, **_packing(values))
+
+
+def placed(study: Study) -> list[tuple[int, int, Curve]]:
+    """Lane, trial and curve, in the order in which the file has them."""
+    return [(k, t, c) for k, lane in enumerate(study.curves) for t, c in enumerate(lane)]
 
 
 def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) -> None:
     """Every curve as it was used, with the model's answer at the estimate; samples end to end."""
     study = result.study
-    placed = [(k, t, c) for k, lane in enumerate(study.curves) for t, c in enumerate(lane)]
-    curves = [c for _, _, c in placed]
+    rows = placed(study)
+    curves = [c for _, _, c in rows]
     names = sorted(files, key=len, reverse=True)
     _write_json(
         group,
@@ -75,15 +108,15 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
             "files": dict(files),
         },
     )
-    group["lane"] = np.array([k for k, _, _ in placed], np.int32)
+    group["lane"] = np.array([k for k, _, _ in rows], np.int32)
     group["samples"] = np.array([len(c.force) for c in curves], np.int64)
     group["s_c"] = np.array([np.nan if c.s_c is None else c.s_c for c in curves])
     group["phi_c"] = np.array([c.phi_c for c in curves])
     group["direction"] = np.array([c.direction for c in curves], np.float64)
     blend = study.lanes.blend
-    group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed])
+    group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in rows])
     seen = result.residuals
-    residual = [seen.force[k, t, : len(c.force)] for k, t, c in placed]
+    residual = [seen.force[k, t, : len(c.force)] for k, t, c in rows]
     columns = {
         "displacement": [c.displacement for c in curves],
         "force": [c.force for c in curves],
@@ -92,11 +125,11 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         "predicted": [c.force + r for c, r in zip(curves, residual, strict=True)],
     }
     if seen.joints is not None and study.lanes.joints is not None:
-        found = [seen.joints[k, t, : len(c.force)] for k, t, c in placed]
+        found = [seen.joints[k, t, : len(c.force)] for k, t, c in rows]
         columns["joint_residual"] = found
         columns["joints"] = [_on_rings(c, study.model.geometry.rings) for c in curves]
     if seen.side_force is not None:
-        found = [seen.side_force[k, t, : len(c.force)] for k, t, c in placed]
+        found = [seen.side_force[k, t, : len(c.force)] for k, t, c in rows]
         given = [_side(c) for c in curves]
         columns["side_force"], columns["side_residual"] = given, found
         columns["side_predicted"] = [F + r for F, r in zip(given, found, strict=True)]
@@ -105,8 +138,8 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         if kind.name == "joints" or left is None:
             continue
         used = np.where(kind.precision > 0, kind.data, np.nan)
-        columns[kind.name] = [used[k, t, : len(c.force)] for k, t, c in placed]
-        columns[f"{kind.name}_residual"] = [left[k, t, : len(c.force)] for k, t, c in placed]
+        columns[kind.name] = [used[k, t, : len(c.force)] for k, t, c in rows]
+        columns[f"{kind.name}_residual"] = [left[k, t, : len(c.force)] for k, t, c in rows]
     for name, parts in columns.items():
         values = np.concatenate(parts)
         group.create_dataset(name, data=values, **_packing(values))
@@ -148,3 +181,65 @@ def _short_source(source: str, names: Sequence[str]) -> str:
 def _write_json(group: h5py.Group, content: object) -> None:
     data = np.frombuffer(json.dumps(content).encode(), np.uint8)
     group.create_dataset("description", data=data, compression="gzip")
+
+
+def read_json(group: Any) -> Any:
+    """The JSON text of a group.
+
+    Raises:
+        ValueError: no such text.
+    """
+    return json.loads(numeric(group, "description").astype(np.uint8).tobytes().decode())
+
+
+def read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]]:
+    """Curves with what of them the fit has used, the lane of each, and SHA-256 by file name."""
+    names = read_json(group)
+    samples = numeric(group, "samples").astype(int)
+    ends = np.cumsum(samples)
+    column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
+    direction = numeric(group, "direction")
+    observed = _observed(group)
+    curves = []
+    texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
+    for i, (specimen, trial, source) in enumerate(texts):
+        part = slice(ends[i] - samples[i], ends[i])
+        sigma = column["sigma"][part]
+        curves.append(
+            Curve(
+                specimen=specimen,
+                trial=trial,
+                s_c=None if np.isnan(column["s_c"][i]) else float(column["s_c"][i]),
+                phi_c=float(column["phi_c"][i]),
+                displacement=column["displacement"][part],
+                force=column["force"][part],
+                sigma=None if np.isnan(sigma).all() else sigma,
+                source=source,
+                direction=(float(direction[i][0]), float(direction[i][1])),
+                **{name: v if v.ndim == 1 else v[part] for name, v in observed.items()},
+            )
+        )
+    return tuple(curves), numeric(group, "lane").astype(int), names["files"]
+
+
+def _observed(group: Any) -> dict[str, Any]:
+    """Fields of curves beside the force, samples end to end; NaN where the fit has not used them.
+
+    Rings are numbered, with no axis of samples.
+    """
+    out: dict[str, Any] = {}
+    if "joints" in group:
+        used = np.isfinite(numeric(group, "joint_residual"))
+        out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)
+    if "side_force" in group:
+        out["side_force"] = numeric(group, "side_force")
+    if "joint_side" in group:
+        out["joint_side_displacement"] = numeric(group, "joint_side")
+        out.setdefault("joint_displacement", np.full_like(out["joint_side_displacement"], np.nan))
+    if "joint_displacement" in out:
+        out["joint_rings"] = np.arange(out["joint_displacement"].shape[1])
+    if "ends" in group:
+        ends = numeric(group, "ends")
+        out["end_U"], out["end_V"] = ends[:, :, 0], ends[:, :, 1]
+        out["end_rings"] = np.arange(ends.shape[1])
+    return out

@@ -10,12 +10,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxtrachea.files.tables import write_csv
+from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analyses import widened
-from jaxtrachea.results.hdf5 import read_hdf5
+from jaxtrachea.results.read import read_again
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
 from jaxtrachea.runs.shards import divide, join, load, replaced, save
@@ -165,11 +165,11 @@ def collect(run: RunFolder, study: Study) -> FitResult:
     result = join(part, [result for result in found if result is not None])
     again = run.manifest.rerun
     if again is None:
-        return dataclasses.replace(result, study=study)
+        return result
     path = run.target / "results.h5"
     if digest(path) != again.results:
         raise NoRun(f"{path} has changed since its failed lanes were fitted again")
-    return replaced(read_hdf5(path, study), np.array(again.lanes), result)
+    return replaced(read_again(path, study), np.array(again.lanes), result)
 
 
 def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
@@ -180,7 +180,7 @@ def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
         if part is not None:
             rows += summary_rows(widened(part))
     try:
-        write_csv(path, rows)
+        Table(rows).write_csv(path)
     except OSError:
         path.unlink(missing_ok=True)  # not half a table
         raise

@@ -106,14 +106,16 @@ def free_memory(workers: int) -> float:
 
 def join(study: Study, parts: list[FitResult]) -> FitResult:
     """One result out of those of consecutive lanes; `study` holds all of them."""
-    each = [arrays_of(part) for part in parts]
+    weighed = any(part.study.shares is not None for part in parts)
+    each = [arrays_of(part, weighed=weighed) for part in parts]
     return result_of(study, {name: np.concatenate([a[name] for a in each]) for name in each[0]})
 
 
 def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
     """The same result with the rows `lanes` from `by` where it succeeded; the others untouched."""
     better = by.succeeded
-    arrays, new = arrays_of(result), arrays_of(by)
+    weighed = any(v.study.shares is not None for v in (result, by))
+    arrays, new = (arrays_of(v, weighed=weighed) for v in (result, by))
     for name, array in arrays.items():
         arrays[name] = array.copy()
         arrays[name][lanes[better]] = new[name][better]

@@ -26,6 +26,7 @@ from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.core import Estimate, predicted
 from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.predict import predict_sources
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import source_of
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.status import PredictionStatus
@@ -36,8 +37,8 @@ VIRTUAL = Path(__file__).parents[2] / "fits" / "virtual_trachea"
 
 def check_coverage(read, noise):
     """Curve band: the true curve; with noise: new noisy samples; 93 to 97 % over the depths."""
-    rng, lanes = np.random.default_rng(8), len(read.specimens)
-    sources = [source_of(read, name) for name in read.specimens]
+    rng, lanes = np.random.default_rng(8), len(pressed(read).specimens)
+    sources = [source_of(read, name) for name in pressed(read).specimens]
     for s in UNSEEN:
         found = predict_sources(read, sources, [s] * lanes, [DEPTHS] * lanes, batch=8)
         truth = true_force(s)
@@ -107,7 +108,8 @@ def test_standard_errors_are_those_of_the_delta_method(read):
     for s, factor in ((45.0, widened), (61.0, 1.0)):
         (curve,) = predict_sources(read, [source], [s], [np.array([3.0])])
         J = slope_at(read, source, s)
-        assert np.isclose(curve.se[0], factor * np.sqrt(J @ read.covariance[3] @ J), rtol=1e-6)
+        C = read.uncertainty.covariance[3]
+        assert np.isclose(curve.se[0], factor * np.sqrt(J @ C @ J), rtol=1e-6)
 
 
 def test_an_undetermined_direction_makes_bands_infinite_where_it_acts(read):
@@ -161,7 +163,7 @@ def test_linear_model_has_the_bands_of_the_text_book(given, tmp_path):
     half = 1.959963984540054 if given else student.ppf(0.975, len(D) - 2)
     at = np.array([0.5, 3.0])
     rows = np.stack([at, at**3], axis=1)
-    growth = read.growth[0]
+    growth = read.effective.growth[0]
     assert 1 < growth < 4
     error = growth * s * np.sqrt(np.sum(rows @ np.linalg.inv(X.T @ X) * rows, axis=1))
     mine = jaxtrachea.predict(read, s=80.0, displacement=at, specimen="T1")
@@ -220,7 +222,7 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     result = fit(build_study(curves, table_1(), synthetic.OPTIONS, synthetic.parameters()), TWO)
     write_hdf5(tmp_path / "results.h5", Findings(result), {"inputs": {"a.csv": "0" * 64}})
     read = jaxtrachea.read_results(tmp_path)
-    source = source_of(read, read.specimens[0])
+    source = source_of(read, pressed(read).specimens[0])
     # EI_L on its upper bound: k_M is a direction by itself, whose slope is 1e-8 of the others'.
     free, null_space = source.free.copy(), np.zeros_like(source.null_space)
     free[:2], null_space[0, 1] = [np.log(1e7), np.log(1e-4)], 1.0

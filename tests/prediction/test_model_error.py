@@ -15,7 +15,7 @@ from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.prediction import model_error
 from jaxtrachea.prediction.held_out import compare
 from jaxtrachea.prediction.model_error import model_errors
-from jaxtrachea.results.stored import from_result
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.status import PredictionStatus
 
 VIRTUAL = Path(__file__).parents[2] / "fits" / "virtual_trachea"
@@ -61,7 +61,7 @@ def test_noise_is_no_error_of_the_model(read):
     """24 specimens that the model describes: nothing is left, and the program reads it back."""
     found = model_errors(read, list(range(24)))
     shares = np.array([found[k].share.max() for k in range(24)])
-    noise = 0.02 / max(c.force.max() for c in read.curves)
+    noise = 0.02 / max(c.force.max() for c in pressed(read).curves)
     assert np.median(shares) < 2 * noise
     assert {e.positions for e in found.values()} == {4}
 
@@ -93,7 +93,9 @@ def test_standard_errors_grow_as_intervals_do(read):
     """Times the growth for alike residuals, at a position of the fit."""
 
     def errors(growth):
-        grown = dataclasses.replace(read, growth=np.full_like(read.growth, growth))
+        grown = dataclasses.replace(read)
+        effective = read.effective._replace(growth=np.full_like(read.effective.growth, growth))
+        vars(grown)["effective"] = effective
         return jaxtrachea.predict(grown, s=45.0, displacement=[1.0, 4.0], specimen="s0001").se
 
     np.testing.assert_allclose(errors(3.0), 3 * errors(1.0), rtol=1e-9)
@@ -116,7 +118,7 @@ def left_out(name, size, count):
         for i, curve in enumerate(all_of):
             (held if i in choices[k] else kept).append(dataclasses.replace(curve, specimen=f"{k}"))
     study = study_of(spec, dataclasses.replace(measured, curves=tuple(kept)))
-    return compare(from_result(fit(study, settings_of(spec))), held)
+    return compare(fit(study, settings_of(spec)), held)
 
 
 @pytest.mark.slow

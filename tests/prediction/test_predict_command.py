@@ -243,7 +243,7 @@ def test_pictures_say_what_they_leave_out_and_cost_themselves_only(read, tmp_pat
     figure = prediction_plots._panels(many_pairs([one] * 11))
     assert figure.axes[0].get_title() == "s0003 (the first 10 of 11 curves)"
     assert figure.get_suptitle() == "all: predictions.csv"
-    curve = dataclasses.replace(read.curves[0], displacement=DEPTHS)
+    curve = dataclasses.replace(read.study.curves[0][0], displacement=DEPTHS)
     compared = [held_out.Compared(curve, p, "no") for p in many[:2]]
 
     def fail(*_):

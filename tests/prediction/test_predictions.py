@@ -28,6 +28,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.predict import predict_sources
 from jaxtrachea.prediction.sources import Source, source_of
+from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.rows import lane_rows
 from jaxtrachea.status import FitStatus, PredictionStatus, PressStatus
@@ -99,18 +100,13 @@ def test_left_out_curve_is_that_of_leave_one_out(tmp_path):
 
 def only(read, lanes):
     """The same fit of the first lanes alone."""
-    fields = ("theta", "covariance", "null_space", "at_bound", "status", "sigma", "half_width",
-              "lane_names")  # fmt: skip
-    count = int(np.sum(read.curve_lane < lanes))
-    cut = {name: getattr(read, name)[:lanes] for name in fields}
-    study = dataclasses.replace(read.study, unknowns=read.study.unknowns[:lanes])
-    curves = {name: getattr(read, name)[:count] for name in ("curves", "curve_lane", "blend")}
-    return dataclasses.replace(read, study=study, **cut, **curves)
+    arrays = {name: v[:lanes] for name, v in arrays_of(read).items()}
+    return result_of(read.study.take(np.arange(lanes)), arrays)
 
 
 def test_unknown_specimens(read):
     """Own parameters of several specimens: no; of one, or all shared: yes, and it is said."""
-    new = dataclasses.replace(read.curves[0], specimen="T9")
+    new = dataclasses.replace(read.study.curves[0][0], specimen="T9")
     (found,) = held_out.compare(read, [new])
     assert found.prediction.status == PredictionStatus.UNKNOWN_SPECIMEN
     assert f"k_1, k_3 belongs to each of {LANES} specimens" in found.prediction.message
@@ -309,7 +305,7 @@ def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_pat
     new = jaxtrachea.predict(read, s=80.0, displacement=D)
     np.testing.assert_allclose(new.force, law(D), rtol=0, atol=near)
     # Residuals here are roundings, which are alike as it happens, and widen the bands.
-    wide = float(read.growth[0])
+    wide = float(read.effective.growth[0])
     np.testing.assert_allclose(new.se, wide * law_error(scope, D), rtol=0.02)
     assert new.status == PredictionStatus.OK
     assert "D from first touch, force without offset" in new.message
@@ -317,7 +313,7 @@ def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_pat
     np.testing.assert_allclose(named.force, 0.3 + law(D), rtol=0, atol=2 * near)
     assert "D and force as trial 'b' records them" in named.message
     # A measured curve is recorded as those of the fit were, or has its own zeros fitted to it.
-    again = dataclasses.replace(read.curves[0], trial="c")
+    again = dataclasses.replace(read.study.curves[0][0], trial="c")
     (found,) = held_out.compare(read, [again])
     np.testing.assert_allclose(found.prediction.force[1:], again.force[1:], rtol=0, atol=0.01)
     assert np.all(np.abs(found.residual[again.displacement > 0.6]) < 2 * near + 1e-9)

@@ -10,7 +10,7 @@ from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.fitting import fit
 from jaxtrachea.measurements.data_files import read_data
-from jaxtrachea.results.hdf5 import read_hdf5
+from jaxtrachea.results.read import read_again
 from jaxtrachea.runs import shards
 
 FIT = ("fit", "spec.toml", "--out", "out")
@@ -53,7 +53,7 @@ def load_peace(peace):
 
 def from_peace(folder):
     """Stand in for `fit.fit`: the same numbers, read back."""
-    whole = read_hdf5(folder / "out" / "results.h5", load_peace(folder))
+    whole = read_again(folder / "out" / "results.h5", load_peace(folder))
     names = [curves[0].specimen for curves in whole.study.curves]
     arrays = shards.arrays_of(whole)
 

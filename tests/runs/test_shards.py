@@ -18,8 +18,7 @@ from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.optimisation import levenberg_marquardt
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.results.hdf5 import read_hdf5
-from jaxtrachea.results.stored import NoResults
+from jaxtrachea.results.read import NoResults, read_again
 from jaxtrachea.runs import checkpoint, rerun, shards
 from jaxtrachea.runs import folder as run_folder
 
@@ -27,7 +26,7 @@ from jaxtrachea.runs import folder as run_folder
 def test_results_are_read_back_bit_for_bit(peace, tmp_path):
     """What write_hdf5 and save wrote comes back; damaged, foreign and truncated shards do not."""
     study = load_peace(peace)
-    result = read_hdf5(peace / "out" / "results.h5", study)
+    result = read_again(peace / "out" / "results.h5", study)
     lanes, path = np.arange(9), tmp_path / "0.npz"
     run_of_it = rerun.read_manifest(peace / "out" / "results.h5")
     shards.save(path, dataclasses.replace(run_of_it, id="me"), lanes, result)
@@ -51,7 +50,7 @@ def test_results_are_read_back_bit_for_bit(peace, tmp_path):
     path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
     assert shards.load(path, "me", lanes, study) is None
     with pytest.raises(NoResults, match="another study"):
-        read_hdf5(peace / "out" / "results.h5", study.take(lanes[:8]))
+        read_again(peace / "out" / "results.h5", study.take(lanes[:8]))
 
 
 def test_sizes_of_shards(peace):

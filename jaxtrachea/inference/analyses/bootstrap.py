@@ -1,18 +1,24 @@
 """The bootstrap in tables, report and results.h5."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.files.tables import markdown_table, number
-from jaxtrachea.fitting.result import unknown_label
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
+from jaxtrachea.files.table import Column, Table, ends
+from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 from jaxtrachea.inference.bootstrap import FEWEST, Bootstrap, bootstrap, check_block
-from jaxtrachea.inference.labels import lane_label
-from jaxtrachea.inference.rows import and_more, listed, more_of
+from jaxtrachea.inference.labels import unknown_rows
+from jaxtrachea.inference.rows import and_more
 
-BOOTSTRAP_HEAD = ["specimen", "parameter", "value", "std. error", "local", "95 % of replicates"]
+COLUMNS = (
+    Column("specimen"),
+    Column("parameter"),
+    Column("value"),
+    Column("std. error", "bootstrap_se", digits=2),
+    Column("local", digits=2),
+    Column("95 % of replicates", ends("bootstrap_low95", "bootstrap_high95")),
+)
 
 
 def _refuse(request: Request) -> None:
@@ -39,53 +45,32 @@ def _cells(found: Bootstrap, lane: int, i: int) -> Cells:
     }
 
 
-def _datasets(group, found: Bootstrap) -> None:
-    group.attrs["kind"], group.attrs["block"] = found.kind, found.block
-    for name in ("theta", "usable", "lower", "upper", "standard_error"):
-        group.create_dataset(name, data=getattr(found, name), compression="gzip")
+def bootstrap_table(found: Bootstrap, lanes: Sequence[int]) -> Table:
+    """Value, standard error by bootstrap and local, percentile interval of every unknown."""
+    result = found.result
 
+    def cells(lane: int, i: int) -> Cells:
+        return {"local": float(result.standard_error[lane, i]), **_cells(found, lane, i)}
 
-def bootstrap_table(found: Bootstrap, lanes: Sequence[int]) -> list[list[str]]:
-    """Lane, parameter, value, standard error by bootstrap and local, percentile interval."""
-    result, rows = found.result, []
-    for lane in lanes:
-        for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
-            low, high = float(found.lower[lane, i]), float(found.upper[lane, i])
-            rows.append(
-                [
-                    lane_label(result, lane),
-                    f"{unknown_label(result, lane, i)} [{p.unit}]",
-                    number(result.value[lane, i]),
-                    number(found.standard_error[lane, i], 2),
-                    number(result.standard_error[lane, i], 2),
-                    "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
-                ]
-            )
-    return rows
+    return Table(
+        unknown_rows(result, lanes, cells),
+        COLUMNS,
+        title="Bootstrap",
+        more=and_more(result.lanes, len(lanes), "parameters.csv"),
+    )
 
 
 def _section(found: Bootstrap) -> list[str]:
-    """The section on the bootstrap."""
-    shown = listed(found.result)
+    """What was resampled, and how much of it was lost."""
     lost = int(np.sum(~found.usable))
     blocks = f" in blocks of {found.block} samples" if found.block > 1 else ""
     return [
-        "## Bootstrap",
-        markdown_table(BOOTSTRAP_HEAD, bootstrap_table(found, shown)),
-        *more_of(found.result, shown, "parameters.csv"),
         f"{found.usable.shape[1]} replicates of every lane ({found.kind}{blocks}); "
         f"{lost} of {found.usable.size} refits did not converge and are left out; a lane with "
         f"fewer than {FEWEST} others has no interval. All numbers: `results.h5` "
         "(docs/read_a_fit.md).",
         *([f"{found.note}."] if found.note else []),
     ]
-
-
-def _shown(found: Bootstrap, lanes: list[int]) -> Iterator[Table | str]:
-    yield "Bootstrap", BOOTSTRAP_HEAD, bootstrap_table(found, lanes)
-    yield from and_more(found.result.lanes, len(lanes), "parameters.csv")
-    if found.note:
-        yield found.note
 
 
 BOOTSTRAP = Analysis(
@@ -97,7 +82,9 @@ BOOTSTRAP = Analysis(
     commands=("fit", "design"),
     refuse=_refuse,
     parameter_cells=_cells,
-    datasets=_datasets,
+    datasets=("theta", "usable", "lower", "upper", "standard_error"),
+    attributes=("kind", "block"),
+    table=bootstrap_table,
     section=_section,
-    shown=_shown,
+    shown=lambda found: [found.note] if found.note else [],
 )

@@ -5,16 +5,25 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.files.tables import markdown_table
+from jaxtrachea.files.table import Column, Table
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
+from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 from jaxtrachea.inference.cross_validation import LeftOut, curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
 from jaxtrachea.inference.together import together_sentence
 
-LEFT_OUT_HEAD = ["specimen", "left out", "force / model", "rms force / peak", "rms joints / D"]
+_ERRORS = {
+    "force_over_model": "force / model",
+    "rms_over_peak": "rms force / peak",
+    "rms_joints_over_displacement": "rms joints / D",
+}
+COLUMNS = (
+    Column("specimen"),
+    Column("left out", "trial"),
+    *(Column(head, name, unit="%", decimals=2) for name, head in _ERRORS.items()),
+)
 
 
 def _refuse(request: Request) -> None:
@@ -28,43 +37,30 @@ def _compute(request: Request, findings: Findings, progress: Progress) -> LeftOu
     return leave_one_out(findings.result, request.settings, progress)
 
 
-def left_out_cells(left_out: LeftOut) -> list[Cells]:
+def left_out_rows(left_out: LeftOut) -> list[Cells]:
     """Rows of left_out.csv: a curve left out and its errors each."""
     errors = (left_out.ratio, left_out.force, left_out.joints)
     rows: list[Cells] = []
     columns = (left_out.lane, left_out.trial, left_out.converged.tolist(), *errors)
     for k, t, converged, *values in zip(*columns, strict=True):
         curve = left_out.study.curves[k][t]
-        names = ("force_over_model", "rms_over_peak", "rms_joints_over_displacement")
-        row: dict[str, object] = {"specimen": curve.specimen, "trial": curve.trial}
-        out = zip(names, values, strict=True)
-        rows.append(row | {name: float(v) for name, v in out} | {"converged": converged})
+        found = {name: float(v) for name, v in zip(_ERRORS, values, strict=True)}
+        names = {"specimen": curve.specimen, "trial": curve.trial}
+        rows.append(names | found | {"converged": converged})
     return rows
 
 
-def left_out_rows(left_out: LeftOut) -> list[list[str]]:
-    """Specimen, curve left out, its errors; the last row is the root mean square."""
-    rows = []
+def left_out_table(left_out: LeftOut) -> Table:
+    """Curves left out, of many the worst first; the last row is the root mean square."""
+    rows = left_out_rows(left_out)
     errors = (left_out.ratio, left_out.force, left_out.joints)
-    for k, t, *values in zip(left_out.lane, left_out.trial, *errors, strict=True):
-        curve = left_out.study.curves[k][t]
-        rows.append([curve.specimen, curve.trial, *map(_percent, values)])
-    mean = [float(rms(v)) for v in errors]
-    return [*rows, ["(root mean square)", "", *map(_percent, mean)]]
-
-
-def left_out_table(left_out: LeftOut) -> tuple[list[list[str]], list[str]]:
-    """Rows of `left_out_rows` for people, and what follows: of many the worst, worst first."""
-    *rows, mean = left_out_rows(left_out)
-    if len(rows) <= ONE_BY_ONE:
-        return [*rows, mean], []
-    order = np.argsort(-np.nan_to_num(left_out.force, nan=np.inf), kind="stable")
-    worst = [rows[k] for k in order[:ONE_BY_ONE]]
-    return [*worst, mean], and_more(len(rows), len(worst), "left_out.csv")
-
-
-def _percent(value: float) -> str:
-    return "–" if np.isnan(value) else f"{100 * value:.2f} %"
+    mean: dict[str, object] = {"specimen": "(root mean square)", "trial": ""}
+    mean |= {name: float(rms(v)) for name, v in zip(_ERRORS, errors, strict=True)}
+    more = and_more(len(rows), ONE_BY_ONE, "left_out.csv")
+    if more:
+        order = np.argsort(-np.nan_to_num(left_out.force, nan=np.inf), kind="stable")
+        rows = [rows[k] for k in order[:ONE_BY_ONE]]
+    return Table([*rows, mean], COLUMNS, title="Leaving one curve out", more=more)
 
 
 def own_touch_sentence(study: Study, which: str) -> list[str]:
@@ -78,19 +74,12 @@ def own_touch_sentence(study: Study, which: str) -> list[str]:
 
 
 def _section(found: LeftOut) -> list[str]:
-    rows, further = left_out_table(found)
-    parts = ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, rows)]
-    parts += [f"{text}." for text in further]
-    parts += own_touch_sentence(found.study, "A curve left out")
+    parts = own_touch_sentence(found.study, "A curve left out")
     parts += [f"{text}." for text in together_sentence(found.study.together)]
     return [*parts, f"{found.sentence}."] if found.sentence else parts
 
 
-def _shown(found: LeftOut, lanes: list[int]) -> Iterator[Table | str]:
-    """Curves left out, of many the worst first, and their root mean square."""
-    rows, further = left_out_table(found)
-    yield "Leaving one curve out", LEFT_OUT_HEAD, rows
-    yield from further
+def _shown(found: LeftOut) -> Iterator[str]:
     yield from together_sentence(found.study.together)
     if found.sentence:
         yield found.sentence
@@ -105,7 +94,8 @@ LEFT_OUT = Analysis(
     work="leaving curves out",
     option="leave-one-out",
     refuse=_refuse,
-    tables=lambda found: {"left_out.csv": left_out_cells(found)},
+    tables=lambda found: {"left_out.csv": Table(left_out_rows(found))},
+    table=lambda found, lanes: left_out_table(found),
     section=_section,
     shown=_shown,
 )

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.config import SpecError
+from jaxtrachea.files.table import Column, Table
 from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import (
@@ -14,7 +15,6 @@ from jaxtrachea.inference.analysis import (
     Findings,
     Progress,
     Request,
-    Table,
     Unavailable,
 )
 from jaxtrachea.inference.design.candidates import (
@@ -93,7 +93,7 @@ def choice_rows(found: Design) -> Iterator[dict[str, object]]:
     for step, error in enumerate(found.choice.error):
         k = int(found.choice.chosen[step - 1])
         place = _place(at, k, names)
-        place = place if step else dict.fromkeys(place, "")
+        place = place if step else dict.fromkeys(place)
         pairs = zip(found.unknowns, error, strict=False)
         errors = {f"{name} relative se": float(e) for name, e in pairs}
         message = extrapolation(study, float(at.depth[k]), found.known.reach) if step else ""
@@ -150,23 +150,29 @@ def _chart_rows(design: Design, found: Map) -> Iterator[Cells]:
 
 def _tables(found: Design):
     return {
-        "next_points.csv": choice_rows(found),
-        "candidates.csv": candidate_rows(found.known, found.added, found.at),
-        "identifiability.csv": map_rows(found),
+        "next_points.csv": Table(choice_rows(found)),
+        "candidates.csv": Table(candidate_rows(found.known, found.added, found.at)),
+        "identifiability.csv": Table(map_rows(found)),
     }
 
 
-def _shown(found: Design, lanes: list[int]) -> Iterator[Table | str]:
+def _table(found: Design, lanes: list[int]) -> Table:
+    """The presses that were chosen, and the errors expected after each."""
     rows = list(choice_rows(found))
-    messages = [str(row.pop("message")) for row in rows]
-    errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
-    turned = [] if found.at.phi is None else ["phi [deg]"]
-    head = ["press", "specimen", "s [mm]", *turned, "depth [mm]", *errors]
-    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
-    yield "Next presses, relative standard errors that fit would report after each", head, cells
-    for step, message in enumerate(messages):
-        if message:
-            yield f"Press {step}: {message}"
+    heads = {"s_mm": "s [mm]", "phi_deg": "phi [deg]", "depth_mm": "depth [mm]"}
+    columns = [
+        Column(heads.get(name, name.removesuffix(" relative se")), name, digits=3, null="")
+        for name in rows[0]
+        if name != "message"
+    ]
+    title = "Next presses, relative standard errors that fit would report after each"
+    return Table(rows, columns, title=title)
+
+
+def _shown(found: Design) -> Iterator[str]:
+    for row in choice_rows(found):
+        if row["message"]:
+            yield f"Press {row['press']}: {row['message']}"
 
 
 def draw_design(design: Design):
@@ -227,6 +233,7 @@ DESIGN = Analysis(
     refuse=_refuse,
     tables=_tables,
     place="design",
+    table=_table,
     shown=_shown,
     figures=lambda found: {"identifiability.png": lambda: draw_design(found)},
 )

@@ -28,7 +28,7 @@ def _lane_cells(found: Findings, lane: int) -> Cells:
         "residual_correlation": float(wide.correlation[lane]),
         "effective_samples": float(wide.samples[lane]),
         "interval_growth": float(wide.growth[lane]),
-        "determined": determined_unknowns(result, lane, found.profiles) if free else "",
+        "determined": determined_unknowns(result, lane, found.profiles) if free else None,
         "missed": where_missed(result, lane) if misses else "",
     }
 
@@ -99,5 +99,5 @@ EFFECTIVE = Analysis(
     parameter_cells=_cells,
     place="quality",
     section=_section,
-    shown=lambda found, lanes: _sentences(found),
+    shown=_sentences,
 )

@@ -1,13 +1,13 @@
 """Influence of samples and curves in tables and report."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.files.tables import markdown_table, number
+from jaxtrachea.files.table import Column, Table, number, words
 from jaxtrachea.fitting.lane import Lane, forces, markers
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
+from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 from jaxtrachea.inference.influence import Influence, influence
 from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
@@ -35,7 +35,10 @@ def _compute(request: Request, findings: Findings, progress: Progress) -> Influe
 
 
 def _tables(found: Influence):
-    return {"influence.csv": sample_rows(found), "influence_curves.csv": curve_rows(found)}
+    return {
+        "influence.csv": Table(sample_rows(found)),
+        "influence_curves.csv": Table(curve_rows(found)),
+    }
 
 
 def sample_rows(found: Influence) -> Iterator[Cells]:
@@ -52,7 +55,7 @@ def sample_rows(found: Influence) -> Iterator[Cells]:
                     "trial": curve.trial,
                     "sample": place.sample + 1,
                     "observed": place.observed,
-                    "ring": "" if place.ring is None else place.ring + 1,
+                    "ring": None if place.ring is None else place.ring + 1,
                     "displacement_mm": float(curve.displacement[place.sample]),
                     "leverage": float(of.leverage[at]),
                     "studentised": float(of.studentised[at]),
@@ -138,35 +141,33 @@ def sample_label(found: Influence, lane: int, t: int, entry: int) -> str:
     return place.label(float(study.curves[lane][t].displacement[place.sample]))
 
 
-def influence_head(found: Influence) -> list[str]:
-    """Head of `influence_rows`."""
-    names = [p.name for p in found.result.study.free]
-    return ["specimen", "curve", *(f"{n}: share, left out" for n in names), "Cook"]
-
-
-def influence_rows(found: Influence, most: int = ONE_BY_ONE) -> list[list[str]]:
+def influence_table(found: Influence, most: int = ONE_BY_ONE) -> Table:
     """Curves: all of few; of many those with the largest Cook's distance."""
-    return [_curve_row(found, *place) for place in _top_curves(found, most)]
-
-
-def influence_section(found: Influence) -> list[str]:
-    """Which curves and samples the estimates hang on."""
     names = [p.name for p in found.result.study.free]
-    table, total = influence_rows(found), sum(map(len, found.result.study.curves))
-    parts = [
-        "## Influence",
-        markdown_table(influence_head(found), table),
-        *(f"{text}." for text in and_more(total, len(table), "influence_curves.csv")),
+    head = ["specimen", "curve", *(f"{n}: share, left out" for n in names), "Cook"]
+    rows = [_curve_row(found, *place) for place in _top_curves(found, most)]
+    total = sum(map(len, found.result.study.curves))
+    table = words("Influence of curves", head, rows)
+    table.more = and_more(total, len(rows), "influence_curves.csv")
+    return table
+
+
+_SAMPLES = (
+    *map(Column, ("specimen", "curve", "sample")),
+    *(Column(name, digits=2) for name in ("leverage", "studentised", "Cook")),
+    Column("moves most"),
+)
+
+
+def _section(found: Influence) -> list[str]:
+    """Which curves and samples the estimates hang on."""
+    rows = [_sample_row(found, *place) for place in top_samples(found, _TOP)]
+    return [
         "Share: part of the variance of an estimate that the noise of this curve makes. Left out: "
         "change of the estimate, in standard errors, if the curve were not there (first order). "
         f"{REASONS} All curves: `influence_curves.csv`.",
         *drivers(found),
-    ]
-    rows = [_sample_row(found, names, *place) for place in top_samples(found, _TOP)]
-    head = ["specimen", "curve", "sample", "leverage", "studentised", "Cook", "moves most"]
-    return [
-        *parts,
-        markdown_table(head, rows),
+        Table(rows, _SAMPLES).markdown(),
         "The samples whose loss would move the estimates most; studentised residuals beyond 3 to 4 "
         "are outliers. All samples: `influence.csv` (docs/read_a_fit.md).",
     ]
@@ -206,16 +207,19 @@ def influence_cell(found: Influence, lane: int, t: int, i: int) -> str:
     return f"{100 * share:.0f} %, {'own' if np.sum(column == unknown) == 1 else 'needed'}"
 
 
-def _sample_row(found: Influence, names: Sequence[str], lane: int, t: int, e: int) -> list[str]:
+def _sample_row(found: Influence, lane: int, t: int, e: int) -> Cells:
     curve, of = found.result.study.curves[lane][t], found.of
-    moves = of.left_out[lane, t, :, e]
-    most = "–"
+    moves, names = of.left_out[lane, t, :, e], [p.name for p in found.result.study.free]
+    most = None
     if np.isfinite(moves).any():
         i = int(np.nanargmax(np.abs(moves)))
         most = f"{names[i]} by {moves[i]:+.2g} std. errors"
-    numbers = (of.leverage[lane, t, e], found.external[lane, t, e], of.cook[lane, t, e])
-    where = sample_label(found, lane, t, e)
-    return [curve.specimen, curve.trial, where, *(number(float(v), 2) for v in numbers), most]
+    return {
+        "specimen": curve.specimen, "curve": curve.trial,
+        "sample": sample_label(found, lane, t, e), "leverage": float(of.leverage[lane, t, e]),
+        "studentised": float(found.external[lane, t, e]), "Cook": float(of.cook[lane, t, e]),
+        "moves most": most,
+    }  # fmt: skip
 
 
 def drivers(found: Influence) -> list[str]:
@@ -231,13 +235,9 @@ def drivers(found: Influence) -> list[str]:
     return [lead, "\n".join(said)] if said else []
 
 
-def _shown(found: Influence, lanes: list[int]) -> Iterator[Table | str]:
-    curves = sum(map(len, found.result.study.curves))
-    rows = influence_rows(found)
-    yield "Influence of curves", influence_head(found), rows
-    yield from and_more(curves, len(rows), "influence_curves.csv")
+def _shown(found: Influence) -> list[str]:
     said = drivers(found)
-    yield from (["\n".join(said)] if said else [])
+    return ["\n".join(said)] if said else []
 
 
 INFLUENCE = Analysis(
@@ -248,6 +248,7 @@ INFLUENCE = Analysis(
     key="influence",
     tables=_tables,
     place="data",
-    section=influence_section,
+    table=lambda found, lanes: influence_table(found),
+    section=_section,
     shown=_shown,
 )

@@ -64,7 +64,7 @@ def _sentences(result: FitResult) -> list[str]:
     return said
 
 
-def _shown(result: FitResult, lanes: list[int]) -> Iterator[str]:
+def _shown(result: FitResult) -> Iterator[str]:
     yield from (sentence.replace("`", "") for sentence in _sentences(result))
 
 

@@ -5,21 +5,35 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import stdtrit
 
-from jaxtrachea.files.tables import markdown_table, number
+from jaxtrachea.files.table import Column, Row, Table, ends, number
 from jaxtrachea.inference.analysis import (
     Analysis,
     Cells,
     Findings,
     Progress,
     Request,
-    Table,
     Unavailable,
 )
 from jaxtrachea.inference.population import Population, population, wanted
 
 #: Share of estimates with errors above half their value from which logarithms are no good scale.
 UNSURE = 0.1
-POPULATION_HEAD = ["parameter", "n", "left out", "mean", "95 % interval", "spread", "95 % interval"]
+
+
+def _spread(row: Row) -> str:
+    sign = "× / " if row["spread_is"] == "factor" else "± "
+    return f"{sign}{number(float(str(row['spread'])))}"
+
+
+COLUMNS = (
+    Column("parameter", lambda row: f"{row['parameter']} [{row['unit']}]"),
+    Column("n", "specimens"),
+    Column("left out", "left_out"),
+    Column("mean"),
+    Column("95 % interval", ends("mean_low95", "mean_high95")),
+    Column("spread", _spread),
+    Column("95 % interval", ends("spread_low95", "spread_high95")),
+)
 
 
 def _asked(request: Request) -> bool:
@@ -64,31 +78,14 @@ def population_rows(of: Population) -> Iterator[Cells]:
         }
 
 
-def population_table(found: Population) -> list[list[str]]:
-    """Parameter, specimens, mean and its interval, spread between specimens and its interval."""
-    rows = []
-    for row in population_rows(found):
-        sign = "× / " if row["spread_is"] == "factor" else "± "
-        cell = {k: number(v) for k, v in row.items() if isinstance(v, float)}
-        rows.append(
-            [
-                f"{row['parameter']} [{row['unit']}]",
-                str(row["specimens"]),
-                str(row["left_out"]),
-                cell["mean"],
-                f"{cell['mean_low95']} … {cell['mean_high95']}",
-                f"{sign}{cell['spread']}",
-                f"{cell['spread_low95']} … {cell['spread_high95']}",
-            ]
-        )
-    return rows
+def population_table(found: Population) -> Table:
+    """Specimens, mean and spread of each parameter, with their intervals."""
+    return Table(population_rows(found), COLUMNS, title="Population")
 
 
 def _section(found: Population) -> list[str]:
-    """The section on the population."""
+    """What the table says."""
     return [
-        "## Population",
-        markdown_table(POPULATION_HEAD, population_table(found)),
         "The specimens as a sample, all whose estimate has an error: their errors are taken out of "
         "the spread between them. Spread: one standard deviation, with scale `log` as "
         "a factor, and the mean is then the geometric one. Estimates drawn towards the mean by "
@@ -121,19 +118,15 @@ def _biased(found: Population) -> list[str]:
     return texts
 
 
-def _shown(found: Population, lanes: list[int]) -> Iterator[Table]:
-    yield "Population", POPULATION_HEAD, population_table(found)
-
-
 POPULATION = Analysis(
     name="population",
     after="bootstrap",
     compute=_compute,
     asked=_asked,
-    tables=lambda found: {"population.csv": population_rows(found)},
+    tables=lambda found: {"population.csv": population_table(found)},
     parameter_cells=Population.shrunk_cells,
     place="estimates",
+    table=lambda found, lanes: population_table(found),
     section=_section,
     warning=_biased,
-    shown=_shown,
 )

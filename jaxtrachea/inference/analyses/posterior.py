@@ -1,23 +1,25 @@
 """Draws from the posterior in tables, report and results.h5."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.files.tables import markdown_table, number
-from jaxtrachea.fitting.result import unknown_label
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
-from jaxtrachea.inference.labels import lane_label
+from jaxtrachea.files.table import Column, Table, ends
+from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.inference.labels import lane_label, unknown_rows
 from jaxtrachea.inference.posterior import MissingSampler, Posterior, posterior, sampler
-from jaxtrachea.inference.rows import and_more, listed, more_of
+from jaxtrachea.inference.rows import and_more
 
 #: Lanes that are named; of more, the number.
 _NAMED = 12
-_DATASETS = (
-    "theta", "sigma", "divergent", "steps", "lost", "rhat", "ess", "median", "lower", "upper",
-)  # fmt: skip
-POSTERIOR_HEAD = [
-    "specimen", "parameter", "median", "posterior 95 %", "R-hat", "effective draws", "chains",
-]  # fmt: skip
+COLUMNS = (
+    Column("specimen"),
+    Column("parameter"),
+    Column("median", "posterior_median"),
+    Column("posterior 95 %", ends("posterior_low95", "posterior_high95")),
+    Column("R-hat", "posterior_rhat"),
+    Column("effective draws", "posterior_ess", digits=3),
+    Column("chains", lambda row: str(row["posterior_verdict"]).partition(":")[0]),
+)
 
 
 def _refuse(request: Request) -> None:
@@ -41,17 +43,12 @@ def _cells(drawn: Posterior, lane: int, i: int) -> Cells:
     verdict = drawn.verdict(lane)
     poor = verdict.startswith("poor")
     ends = {"median": drawn.median, "low95": drawn.lower, "high95": drawn.upper}
-    cells = {f"posterior_{name}": "" if poor else float(v[lane, i]) for name, v in ends.items()}
+    cells = {f"posterior_{name}": None if poor else float(v[lane, i]) for name, v in ends.items()}
     return cells | {
         "posterior_rhat": float(drawn.rhat[lane, i]),
         "posterior_ess": float(drawn.ess[lane, i]),
         "posterior_verdict": verdict,
     }
-
-
-def _datasets(group, drawn: Posterior) -> None:
-    for name in _DATASETS:
-        group.create_dataset(name, data=getattr(drawn, name), compression="gzip")
 
 
 def not_good(drawn: Posterior) -> dict[int, str]:
@@ -74,51 +71,29 @@ def distrust(drawn: Posterior) -> list[str]:
     ]
 
 
-def posterior_rows(drawn: Posterior, lanes: Sequence[int]) -> list[list[str]]:
+def posterior_table(drawn: Posterior, lanes: Sequence[int]) -> Table:
     """Medians, intervals and what they are worth; poor chains have neither median nor interval."""
-    result, rows = drawn.result, []
-    for lane in lanes:
-        grade = drawn.verdict(lane).partition(":")[0]
-        for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
-            median, low, high = (
-                number(float(v[lane, i])) for v in (drawn.median, drawn.lower, drawn.upper)
-            )
-            rows.append(
-                [
-                    lane_label(result, lane),
-                    f"{unknown_label(result, lane, i)} [{p.unit}]",
-                    "–" if grade == "poor" else median,
-                    "–" if grade == "poor" else f"{low} … {high}",
-                    number(float(drawn.rhat[lane, i])),
-                    number(float(drawn.ess[lane, i]), 3),
-                    grade,
-                ]
-            )
-    return rows
+    result = drawn.result
+    return Table(
+        unknown_rows(result, lanes, lambda lane, i: _cells(drawn, lane, i)),
+        COLUMNS,
+        title="Posterior",
+        more=and_more(result.lanes, len(lanes), "parameters.csv"),
+    )
 
 
 def _section(drawn: Posterior) -> list[str]:
-    """Medians and intervals of the draws, and whether the chains deserve trust."""
-    result = drawn.result
-    shown = listed(result)
+    """How many draws there are, and whether the chains deserve trust."""
     chains, draws = drawn.theta.shape[1:3]
     longer = drawn.steps[drawn.steps > draws]
     more = f", {longer.min()} to {longer.max()} in {len(longer)} fits" if len(longer) else ""
     return [
-        "## Posterior",
-        markdown_table(POSTERIOR_HEAD, posterior_rows(drawn, shown)),
-        *more_of(result, shown, "parameters.csv"),
         f"{chains} chains of {draws} draws (NUTS{more}), priors uniform in scaled coordinates "
         "between the bounds. Good: R-hat up to 1.01, 400 effective draws, nothing divergent. Of "
         "poor chains (R-hat above 1.05, less than 100 effective draws, or more than 2 % divergent) "
         "no interval is given. All draws: `results.h5` (docs/read_a_fit.md).",
         *(distrust(drawn) or ["All chains are good."]),
     ]
-
-
-def _shown(drawn: Posterior, lanes: list[int]) -> Iterator[Table | str]:
-    yield "Posterior", POSTERIOR_HEAD, posterior_rows(drawn, lanes)
-    yield from and_more(drawn.result.lanes, len(lanes), "parameters.csv")
 
 
 def _poor(drawn: Posterior) -> bool:
@@ -134,10 +109,21 @@ POSTERIOR = Analysis(
     key="posterior",
     refuse=_refuse,
     parameter_cells=_cells,
-    datasets=_datasets,
+    datasets=(
+        "theta",
+        "sigma",
+        "divergent",
+        "steps",
+        "lost",
+        "rhat",
+        "ess",
+        "median",
+        "lower",
+        "upper",
+    ),  # fmt: skip
     place="data",
+    table=posterior_table,
     section=_section,
     warning=distrust,
-    shown=_shown,
     poor=_poor,
 )

@@ -1,6 +1,5 @@
 """Profile likelihood in tables, report, results.h5 and picture."""
 
-import json
 from collections.abc import Iterator, Sequence
 from functools import partial
 
@@ -8,15 +7,17 @@ import numpy as np
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.pictures import grid, of_all
-from jaxtrachea.files.tables import interval, markdown_table, number
+from jaxtrachea.files.table import Column, Interval, Table
 from jaxtrachea.fitting.result import unknown_label, within_bounds
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
+from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.profile import Profiles, profiles
-from jaxtrachea.inference.rows import LINES, and_more, listed, more_of
+from jaxtrachea.inference.rows import LINES, and_more, listed
 from jaxtrachea.status import ProfileEnd
 
-PROFILE_HEAD = ["specimen", "parameter", "value", "profile 95 %", "local 95 %", "ends"]
+COLUMNS = tuple(
+    map(Column, ("specimen", "parameter", "value", "profile 95 %", "local 95 %", "ends"))
+)
 
 
 def names_of(request: Request) -> tuple[str, ...]:
@@ -77,15 +78,8 @@ def profile_rows(found: Profiles) -> Iterator[Cells]:
             }
 
 
-def _datasets(group, found: Profiles) -> None:
-    for name in ("lane", "unknown", "lower", "upper", "threshold", "theta", "statistic"):
-        group.create_dataset(name, data=getattr(found, name))
-    codes = group.create_dataset("end", data=found.end.astype(np.int8))
-    codes.attrs["meaning"] = json.dumps({int(e): e.message for e in ProfileEnd})
-
-
-def profile_table(found: Profiles, lanes: Sequence[int]) -> list[list[str]]:
-    """Lane, parameter, value, interval by profile and by standard error, how the profile ends."""
+def profile_table(found: Profiles, lanes: Sequence[int]) -> Table:
+    """Value, interval by profile and by standard error, how the profile ends."""
     result, rows = found.result, []
     place = {lane: n for n, lane in enumerate(lanes)}
     pairs = [(k, lane, i) for k, (lane, i) in enumerate(found.pairs) if lane in place]
@@ -95,30 +89,26 @@ def profile_table(found: Profiles, lanes: Sequence[int]) -> list[list[str]]:
         local = (float(v[lane, i]) for v in (result.lower, result.upper))
         local = within_bounds(result, lane, i, *local)
         rows.append(
-            [
-                lane_label(result, lane),
-                f"{unknown_label(result, lane, i)} [{p.unit}]",
-                number(float(result.value[lane, i])),
-                interval(found.lower[k], found.upper[k], log=p.scale == "log"),
-                interval(*local, log=p.scale == "log"),
-                low if low == high else f"{low}, {high}",
-            ]
+            {
+                "specimen": lane_label(result, lane),
+                "parameter": f"{unknown_label(result, lane, i)} [{p.unit}]",
+                "value": float(result.value[lane, i]),
+                "profile 95 %": Interval(found.lower[k], found.upper[k], p.scale == "log"),
+                "local 95 %": Interval(*local, p.scale == "log"),
+                "ends": low if low == high else f"{low}, {high}",
+            }
         )
-    return rows
+    more = and_more(result.lanes, len(lanes), "parameters.csv")
+    return Table(rows, COLUMNS, title="Profile likelihood", more=more)
 
 
 def _section(found: Profiles) -> list[str]:
-    """The section on profile likelihood."""
-    result = found.result
-    shown = listed(result)
+    """How the profiles end, and whether one found a better fit."""
 
     def count(end):
         return int(np.sum((found.end == end).any(axis=1)))
 
     parts = [
-        "## Profile likelihood",
-        markdown_table(PROFILE_HEAD, profile_table(found, shown)),
-        *more_of(result, shown, "parameters.csv"),
         f"{len(found.lane)} profiles: {count(ProfileEnd.OPEN)} open on a side (the data do not "
         f"limit the parameter there), {count(ProfileEnd.BOUND)} limited only because another "
         f"unknown is on its bound, {count(ProfileEnd.FAILED)} failed. All other unknowns are "
@@ -126,17 +116,12 @@ def _section(found: Profiles) -> list[str]:
     ]
     better = np.flatnonzero(found.improved)
     if len(better):
-        names = sorted({lane_label(result, int(found.lane[k])) for k in better})
+        names = sorted({lane_label(found.result, int(found.lane[k])) for k in better})
         parts.append(
             f"**A profile found a better fit than the fit itself** ({', '.join(names[:20])}): "
             "these intervals are wrong. Fit again with more starts."
         )
     return [*parts, "![profiles](profiles.png)"] if len(found.lane) else parts
-
-
-def _shown(found: Profiles, lanes: list[int]) -> Iterator[Table | str]:
-    yield "Profile likelihood", PROFILE_HEAD, profile_table(found, lanes)
-    yield from and_more(found.result.lanes, len(lanes), "parameters.csv")
 
 
 def _figures(found: Profiles):
@@ -193,10 +178,20 @@ PROFILES = Analysis(
     option="profile",
     key="profile",
     refuse=_refuse,
-    tables=lambda found: {"profiles.csv": profile_rows(found)},
+    tables=lambda found: {"profiles.csv": Table(profile_rows(found))},
     parameter_cells=_cells,
-    datasets=_datasets,
+    datasets=(
+        "lane",
+        "unknown",
+        "lower",
+        "upper",
+        "threshold",
+        "theta",
+        "statistic",
+        "end",
+    ),  # fmt: skip
+    meanings={"end": ProfileEnd},
+    table=profile_table,
     section=_section,
-    shown=_shown,
     figures=_figures,
 )

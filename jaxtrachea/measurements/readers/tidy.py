@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.files.tables import unquoted
+from jaxtrachea.files.table import unquoted
 from jaxtrachea.measurements.checks import STEADY, bad, position
 from jaxtrachea.measurements.columns import curve_of_columns
 from jaxtrachea.measurements.curve import (
