@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.levels.level import Level
 
 #: Fields of a curve that only a model of presses in any direction reads, and what they are called.
 VECTORS = {
@@ -19,15 +20,18 @@ VECTORS = {
 LEFT_OUT: dict[str, None] = dict.fromkeys((*VECTORS, "end_rings"))
 
 
-def along_the_normal(curves: Sequence[Curve]) -> tuple[list[Curve], str | None]:
-    """Curves as a model reads them that knows motions and forces along the normal alone.
+def as_read(curves: Sequence[Curve], level: Level) -> tuple[Sequence[Curve], str | None]:
+    """Curves as a level reads them: without vectors where it presses along the normal alone.
 
     Args:
-        curves: presses along the normal.
+        curves: that the level admits.
+        level: of the model.
 
     Returns:
         The curves without their vectors, and a sentence on what was left out; None: nothing was.
     """
+    if level.off_midline:
+        return curves, None
     counts = {name: sum(_holds(c, name) for c in curves) for name in VECTORS}
     counts = {name: count for name, count in counts.items() if count}
     plain = [
