@@ -75,11 +75,6 @@ class Options:
                     f"skeleton={self.skeleton!r} needs {name}={only!r}, found {value!r}: {why}"
                 )
 
-    @property
-    def deforms_sections(self) -> bool:
-        """Whether rings change their shape; scenes ask it still."""
-        return self.skeleton == "sections"
-
     def places(self, length: float) -> tuple[float, float]:
         """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
         return self.half_width, length - self.half_width
