@@ -75,6 +75,7 @@ WITHIN = {
         {"read"},
         {"data_files", "guess", "usage_tables"},
     ],
+    "mechanics/levels": [{"level", "options"}, {"line", "sections"}, {"choose"}],
     "mechanics/sections": [
         {"section", "block", "material"},
         {"section_tangent", "span"},
@@ -89,7 +90,7 @@ WITHIN = {
         {"lanes", "refusals"},
         {"onset", "zeros"},
         {"study"},
-        {"map_lanes", "zeros_told", "press_scale", "section_residual"},
+        {"map_lanes", "zeros_told", "press_scale", "forward_residual"},
         {"residual"},
         {"cost"},
         {"descent", "starts"},

@@ -23,11 +23,11 @@ from jaxtrachea.fitting.lane import (
     without_data,
 )
 from jaxtrachea.fitting.lanes import Noise, Weighting
+from jaxtrachea.fitting.model import values_of
 from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.refusals import Size, check_curve
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
-from jaxtrachea.fitting.section_residual import section_material
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import Findings
@@ -553,7 +553,8 @@ def test_results_from_before_a_parameter_was_there_have_its_default():
     older = dataclasses.replace(study.model, columns=tuple(columns[j] for j in keep))
     value = jnp.asarray(study.lanes.value[0, 0, np.array(keep)])
     free = jnp.array([p.to_scaled(p.value) for p in study.parameters if not p.fixed])
-    material, values = section_material(older, free, value)
+    values = values_of(older, free, value)
+    material = older.level.material(values)
     assert "c_end" not in values
     assert material.c_end == 1
     assert material.c_W == values["c_W"]

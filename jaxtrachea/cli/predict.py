@@ -162,16 +162,14 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.table import Table
-    from jaxtrachea.fitting.unread import along_the_normal
+    from jaxtrachea.fitting.unread import as_read
     from jaxtrachea.prediction import report, tables
     from jaxtrachea.prediction.held_out import compare, pressable
     from jaxtrachea.prediction.plots import draw_compared
 
     measurements, notes = measured_curves(stored, given)
     curves, unusable = pressable(stored, measurements.curves)
-    unread = None
-    if not stored.study.model.options.deforms_sections:
-        curves, unread = along_the_normal(curves)
+    curves, unread = as_read(curves, stored.study.model.level)
     notes += [] if unread is None else [unread]
     bad = [*measurements.bad, *unusable]
     print_bad(dataclasses.replace(measurements, bad=tuple(bad)))

@@ -10,14 +10,15 @@ from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held
 from jaxtrachea.fitting.refusals import Refusal, Size, refusal
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
-from jaxtrachea.fitting.unread import along_the_normal
+from jaxtrachea.fitting.unread import as_read
 from jaxtrachea.fitting.zeros import without_line, zeros_of
 from jaxtrachea.inference.together import left_out_together
 from jaxtrachea.measurements.read import (
     BadCurve,
     Measurements,
 )
-from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.sections.material import LEAST, SECTION_VALUES, Wall
 from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS
 from jaxtrachea.optimisation.trust_region import Tolerances
@@ -183,9 +184,7 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
         bad.append(BadCurve(*place, kind, error.problem, cure))
     if reasons and not good:
         raise SpecError(reasons[0])
-    unread = None
-    if not options.deforms_sections:
-        good, unread = along_the_normal(good)
+    good, unread = as_read(good, level_of(options))
     notes = measurements.notes if unread is None else (*measurements.notes, unread)
     return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad), notes=notes)
 

@@ -123,10 +123,9 @@ def assemble(model: FitModel, parts: Array, lane: Lane) -> Array:
 
 
 def rounding_cost(model: FitModel, lane: Lane, sigma: Any, dtype: Any = None) -> Any:
-    """Cost that rounding alone leaves: ten roundings of every force, of one lane or of many.
+    """Cost that rounding alone leaves in every force, of one lane or of many.
 
-    Of deforming cross-sections a hundred: an equilibrium found by iteration leaves more than a
-    formula.
+    An equilibrium found by iteration leaves more than a formula (`Level.roundings`).
 
     Args:
         model: what is fitted (static).
@@ -134,8 +133,7 @@ def rounding_cost(model: FitModel, lane: Lane, sigma: Any, dtype: Any = None) ->
         sigma: of (force, markers), likewise.
         dtype: of the computation; None: that of the lane.
     """
-    roundings = 100.0 if model.options.deforms_sections else 10.0
-    of_one = roundings * epsilon(lane.force.dtype if dtype is None else dtype)
+    of_one = model.level.roundings * epsilon(lane.force.dtype if dtype is None else dtype)
     return data_weight(lane, sigma) * of_one**2
 
 
@@ -178,11 +176,11 @@ class LaneCost(eqx.Module):
     def ahead(self, point: Point, theta, step) -> Float[Array, " P"]:
         """J^T times the residual's second derivative along the step, by a probe on the way.
 
-        Of deforming cross-sections zeros: a probe costs as much as a step there, and twice the time
-        to compile, and the steps are straight enough.
+        Of a level that iterates zeros: a probe costs as much as a step there, and twice the time to
+        compile, and the steps are straight enough.
         """
         model, lane = self.model, self.lane
-        if model.options.deforms_sections:
+        if model.level.iterates:
             return jnp.zeros_like(theta)
         along = of_trials(model, step, lane)
         probe = residual_value(model, theta + PROBE * step, lane, self.geometry)

@@ -11,7 +11,9 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.parameters import Parameter, Scale
-from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.level import Level
+from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.trachea.geometry import Geometry
 
 Common = Literal["all", "beam", "nothing"]
@@ -75,6 +77,11 @@ class FitModel:
         """
         check_word("loss", self.loss, Loss)
         check_word("common", self.common, Common)
+
+    @property
+    def level(self) -> Level:
+        """The level that the options ask for."""
+        return level_of(self.options)
 
     @property
     def geometry(self) -> Geometry:

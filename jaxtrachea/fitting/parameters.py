@@ -8,7 +8,9 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
-from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.line import OF_BEAM
+from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES, TOOL_RADIUS, Wall, from_wall
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS, VALUES, Declaration, Fitted, Scale, Scope
@@ -125,30 +127,16 @@ DECLARED: Mapping[str, Declaration] = VALUES | SECTION_VALUES | OF_PRESS
 #: Every parameter that can be identified, with its defaults.
 DEFAULTS = {name: _of(p, p.fit) for name, p in DECLARED.items() if p.fit is not None}
 #: Parameters of the beam; of a line of joints all others act at the contact.
-SKELETON = tuple(
-    name for name in DEFAULTS if DECLARED[name].part == "skeleton" and name not in SECTION_VALUES
-)
+SKELETON = OF_BEAM
 #: Parameters of single presses that are no property of the specimen: errors are measured against
 #: the range of displacement and the largest force.
 OF_THE_PRESS = tuple(OF_PRESS)
 
 
 def visible(options: Options, *, joints: bool) -> list[str]:
-    """Names of the parameters that the chosen model can see, in table order.
-
-    A skeleton of deforming cross-sections has its own, whatever there is to see. With coupling
-    `total` and no joint markers the skeleton does not enter: force-displacement curves then see the
-    local law alone.
-    """
-    if options.deforms_sections:
-        press = [name for name in OF_PRESS if name != "force_slope"]
-        return [name for name in DEFAULTS if name in SECTION_VALUES or name in press]
-    has = {"": True, "shear": options.shear, "two-material": options.local == "two-material",
-           "softening": options.skeleton == "softening"}  # fmt: skip
-    unseen = SKELETON if options.coupling == "total" and not joints else ()
-    if options.contact == "bonded":  # no record of it has air, where alone a line shows
-        unseen = (*unseen, "force_slope")
-    return [n for n in DEFAULTS if has.get(DECLARED[n].needs, False) and n not in unseen]
+    """Names of the parameters that the chosen model can see, in table order."""
+    needed = level_of(options).needs(joints=joints)
+    return [name for name in DEFAULTS if name in needed]
 
 
 def in_model(options: Options, *, joints: bool, named: Collection[str] = ()) -> list[str]:
@@ -183,7 +171,7 @@ def defaults_of(
     Raises:
         InputError: a wall for a model that does not read it.
     """
-    if not options.deforms_sections:
+    if not level_of(options).reads_wall:
         if wall is not None:
             raise InputError(
                 "moduli and thicknesses are read by the skeleton 'sections' alone", key="wall",

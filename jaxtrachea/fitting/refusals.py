@@ -8,31 +8,9 @@ import numpy as np
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.parameters import OF_THE_PRESS, Parameter
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.mechanics.press import Options
-from jaxtrachea.mechanics.sections.press import tested_angle
-from jaxtrachea.trachea.geometry import Geometry
-
-
-class Size(NamedTuple):
-    """What a press must keep to of a tube, in plain numbers: many curves are held against it.
-
-    Attributes:
-        length: mm.
-        radius: mm.
-        half_angle: half opening of the C-rings, rad.
-        rings: how many there are.
-    """
-
-    length: float
-    radius: float
-    half_angle: float
-    rings: int
-
-    @classmethod
-    def of(cls, geometry: Geometry) -> "Size":
-        """The size of a tube."""
-        length, radius, angle = map(float, (geometry.length, geometry.radius, geometry.half_angle))
-        return cls(length, radius, angle, geometry.rings)
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.level import Size
+from jaxtrachea.mechanics.levels.options import Options
 
 
 class Refusal(NamedTuple):
@@ -94,10 +72,8 @@ def check_curve(curve: Curve, size: Size, options: Options, onset: float = 0.0) 
         onset: displacement at first touch, mm: held there, or the first guess.
 
     Raises:
-        InputError: no contact position, one outside the tube, one off the midline or a tool that
-            moves aside where the skeleton is a line of joints, a tool whose width reaches beyond an
-            end of the tube, a marker or an end of a ring that does not exist; specimen and trial
-            are named.
+        InputError: no contact position, one outside the tube, what the level does not admit, a
+            marker or an end of a ring that does not exist; specimen and trial are named.
     """
     where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
     length, rings = size.length, size.rings
@@ -113,32 +89,8 @@ def check_curve(curve: Curve, size: Size, options: Options, onset: float = 0.0) 
             f"contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm",
             place=where,
         )
-    else:
-        _check_width(curve.s_c, length, options, where)
-    if options.deforms_sections:
-        if not abs(curve.phi_c) <= size.half_angle:
-            raise InputError(
-                f"contact at phi = {np.degrees(curve.phi_c):.3g} deg, expected on the cartilage, "
-                f"within {np.degrees(size.half_angle):.3g} deg of the midline",
-                place=where,
-            )
-        if not abs(curve.phi_c) <= (most := float(tested_angle(size.half_angle)) + 1e-6):
-            raise InputError(
-                f"contact at phi = {np.degrees(curve.phi_c):.3g} deg, expected within "
-                f"{np.degrees(most):.3g} deg of the midline: nearer to the ends of the rings "
-                "deforming cross-sections are too stiff",
-                place=where,
-                cure="leave the curve out",
-            )
-        if (deepest := float(np.max(np.abs(curve.displacement - onset)))) > size.radius:
-            raise InputError(
-                f"pressed {deepest:.3g} mm deep, expected no more than the radius, "
-                f"{size.radius:g} mm",
-                place=where,
-                cure="cut the curve off (displacement_max) or leave it out",
-            )
-    else:
-        _check_normal(curve, options, where)
+    if (refused := level_of(options).admits(curve, size, onset)) is not None:
+        raise InputError.like(refused, place=where)
     if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
         found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
         raise InputError(found, place=where)
@@ -182,48 +134,3 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
             cure="use force_sign = -1 and displacement_sign = -1 where the file counts compression "
             "negative, contact = 'bonded' where it pulls, or fit the onset",
         )
-
-
-def _check_normal(curve: Curve, options: Options, where: str) -> None:
-    """Refuse a press that a line of joints does not have.
-
-    Raises:
-        InputError: naming specimen and trial, and the level that has it.
-    """
-    cure = "choose skeleton = 'sections' and contact = 'bonded', or leave the curve out"
-    if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
-        raise InputError(
-            f"contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on the "
-            "anterior midline (phi = 0) only",
-            place=where,
-            cure=cure,
-        )
-    if abs(curve.direction[1]) > 1e-6:
-        shown = ", ".join(f"{v:.4g}" for v in curve.direction)
-        raise InputError(
-            f"the tool moves in the direction ({shown}); this model presses along the inward "
-            "normal (1, 0) only",
-            place=where,
-            cure=cure,
-        )
-
-
-def _check_width(s_c: float, length: float, options: Options, where: str) -> None:
-    """Refuse a tool of which a part lies off the tube.
-
-    Raises:
-        InputError: naming the curve, the width and the places for it.
-    """
-    low, high = options.places(length)
-    if low <= s_c <= high:
-        return
-    expected = f"s from {low:g} to {high:g} mm"
-    if low > high:
-        expected = f"a tool no wider than the tube is long, {length:g} mm"
-    raise InputError(
-        f"contact at s = {s_c:g} mm, where a tool of half_width {options.half_width:g} mm reaches "
-        "beyond an end of the tube",
-        place=where,
-        expected=expected,
-        cure="leave the curve out, or make half_width smaller (0: the tool touches at a point)",
-    )

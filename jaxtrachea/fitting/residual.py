@@ -13,24 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._in_order import lanes_in_one_kernel
-from jaxtrachea.fitting import section_residual
+from jaxtrachea.fitting import forward_residual
 from jaxtrachea.fitting.lane import Lane, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import SKELETON
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import Law, coefficient
-from jaxtrachea.mechanics.press import (
-    compliance,
-    ligament_beam,
-    local_law,
-    respond,
-    softening_of,
-    touch,
-    unit_deflection,
-)
+from jaxtrachea.mechanics.levels.level import Closed, Motion
 from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import Material, material_of
 
 
 class Residual(NamedTuple):
@@ -90,10 +81,10 @@ def inputs(
         geometry: the tube, may be traced; None: of the model.
 
     Raises:
-        ValueError: a skeleton of deforming cross-sections, which no few numbers describe.
+        ValueError: a level without a closed form, which no few numbers describe.
     """
-    if model.options.deforms_sections:
-        raise ValueError("a skeleton of deforming cross-sections has no compliance of its own")
+    if model.level.closed is None:
+        raise ValueError(f"the skeleton {model.level.name!r} has no compliance of its own")
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
     skeleton = _skeleton(model, free, _places(lane), tube)
 
@@ -117,8 +108,8 @@ def residual(
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    if model.options.deforms_sections:
-        return Residual(*section_residual.residual(model, free, of_press(lane), tube))
+    if model.level.closed is None:
+        return Residual(*forward_residual.residual(model, free, of_press(lane), tube))
     skeleton, by_beam = _skeleton_and_derivative(model, free, _places(lane), tube)
 
     def one(*trial):
@@ -132,16 +123,14 @@ def residual_value(
 ) -> Float[Array, "T m"]:
     """`residual` without its Jacobian."""
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    if model.options.deforms_sections:
-        return section_residual.residual_value(model, free, of_press(lane), tube)
+    if model.level.closed is None:
+        return forward_residual.residual_value(model, free, of_press(lane), tube)
     skeleton = _skeleton_of_lanes(model, free, _places(lane), tube)
 
     def one(free, skeleton, trial):
         at = _at_contact(model, free, trial.value, trial.s_c, tube)
-        solved = respond(
-            trial.displacement, at.onset, _felt(model, skeleton), at.law, model.options,
-            trial.blend, at.softening,
-        )  # fmt: skip
+        motion = Motion(trial.s_c, trial.displacement, at.onset, trial.blend)
+        solved = _closed(model).respond(motion, _felt(model, skeleton), at.law, at.softening)
         load = solved.force if solved.load is None else solved.load
         joints = None if skeleton.joints is None else _times(load, skeleton.joints)
         without = at.force_offset
@@ -170,11 +159,11 @@ def _beam_columns(model: FitModel) -> tuple[int, ...]:
     return tuple(i for i, p in enumerate(model.free) if p.name in SKELETON)
 
 
-def material_and_values(model: FitModel, free, value) -> tuple[Material, dict[str, Array]]:
-    """Material of one trial, and the value of every parameter by name."""
-    values = values_of(model, free, value)
-    one = jnp.ones((), free.dtype)  # where the skeleton is not part of the model
-    return material_of({"EI_L": one, "k_M": one} | values), values
+def _closed(model: FitModel) -> Closed:
+    """The closed form of a level that has one."""
+    closed = model.level.closed
+    assert closed is not None
+    return closed
 
 
 def _tube(model: FitModel, geometry: Geometry | None, dtype) -> Geometry:
@@ -202,12 +191,8 @@ def _skeleton(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleto
     """What moves under a unit force in every trial."""
 
     def at(free, value, s_c):
-        material, _ = material_and_values(model, free, value)
-        if not places.marked:
-            return Skeleton(compliance(tube, material, s_c, model.options), None)
-        beam = ligament_beam(tube, material, model.options)
-        unit = unit_deflection(beam, s_c, model.options)
-        return Skeleton(unit.w_C, unit.w)
+        material = model.level.material(values_of(model, free, value))
+        return Skeleton(*_closed(model).skeleton(tube, material, s_c, joints=places.marked))
 
     if model.options.coupling == "total" and not places.marked:
         return Skeleton(jnp.zeros_like(places.s_c), None)
@@ -266,17 +251,15 @@ class _Contact(NamedTuple):
 
 
 def _at_contact(model: FitModel, free, value, s_c, tube: Geometry) -> _Contact:
-    material, values = material_and_values(model, free, value)
-    law = local_law(tube, material, s_c, model.options)
-    softening = softening_of(material, model.options)
+    values = values_of(model, free, value)
+    law, softening = _closed(model).local(tube, model.level.material(values), s_c)
     zeros = values["onset"], values["force_offset"]
     return _Contact(law, *zeros, softening, values.get("force_slope"))
 
 
 def _felt(model: FitModel, skeleton: Skeleton):
-    """Compliance that the contact force depends on: none with the paper's total coupling."""
-    c = skeleton.compliance
-    return c if model.options.coupling == "series" else jnp.zeros_like(c)
+    """Compliance that the contact force depends on."""
+    return _closed(model).felt(skeleton.compliance)
 
 
 def _times(load: Float[Array, " N"], joints: Float[Array, " rings"]) -> Float[Array, "N rings"]:
@@ -323,22 +306,13 @@ class _Pressed(NamedTuple):
     corner: Float[Array, " N"] | None
 
 
-class _Tool(NamedTuple):
-    """A press without data; the fields are those of a `Lane`'s trial."""
-
-    value: Float[Array, " J"]
-    s_c: Float[Array, ""]
-    displacement: Float[Array, " N"]
-    blend: Float[Array, ""] | None
-
-
-def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) -> _Pressed:
+def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion) -> _Pressed:
     """One press, given the skeleton at its place."""
-    D, blend = trial.displacement, trial.blend
+    D, blend = motion.displacement, motion.blend
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
 
     def at_contact(free):
-        return _at_contact(model, free, trial.value, trial.s_c, tube)
+        return _at_contact(model, free, value, motion.s_c, tube)
 
     def push(t):
         return jax.jvp(at_contact, (free,), (t,))
@@ -353,22 +327,23 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
 
     d_skeleton = jax.tree.map(all_columns, by_beam)
     law, c = contact.law, _felt(model, skeleton)
-    solved = respond(D, contact.onset, c, law, model.options, blend, contact.softening)
+    moved = motion._replace(onset=contact.onset)
+    solved = _closed(model).respond(moved, c, law, contact.softening)
     of_force, of_load = sensitivity(solved, c, law, contact.softening)
 
     def at(onset):
-        return touch(D, onset, model.options, blend)
+        return _closed(model).touch(D, onset, blend)
 
     def slope(onset):
         return jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]
 
-    moved = slope(contact.onset)
+    by_onset = slope(contact.onset)
     d_inputs = {"compliance": _felt(model, d_skeleton), "onset": d_contact.onset}
     for record in (d_contact.law.coefficients(), _fields(d_contact.softening)):
         d_inputs.update(record)
 
     def pushed(by):
-        by = by | {"onset": by["displacement"] * moved}
+        by = by | {"onset": by["displacement"] * by_onset}
         out = jnp.zeros((len(eye), *D.shape), D.dtype)
         for name in (name for name in d_inputs if name in _felt_through(model)):
             out = out + d_inputs[name][:, None] * by[name][None]
@@ -400,7 +375,8 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
 
 def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, trial: Lane):
     """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
-    pressed = _press(model, tube, free, skeleton, by_beam, trial)
+    motion = Motion(trial.s_c, trial.displacement, blend=trial.blend)
+    pressed = _press(model, tube, free, trial.value, skeleton, by_beam, motion)
     joints, d_joints = None, None
     if skeleton.joints is not None and pressed.d_joints is not None:
         joints = _times(pressed.load, skeleton.joints)
@@ -438,19 +414,19 @@ def force_jacobian(
         s_c: mm.
         displacement: of the tool, mm.
         blend: rounded corner at the onset, mm, see `Lane`.
-        phi_c: contact angle, rad, the tool along the normal; deforming cross-sections alone; None:
-            on the midline.
+        phi_c: contact angle, rad, the tool along the normal; None: on the midline.
     """
     tube = _tube(model, None, free.dtype)
-    if model.options.deforms_sections:
-        along = None if phi_c is None else jnp.asarray([1.0, 0.0], free.dtype)
-        tool = section_residual.Tool(s_c, displacement, phi_c, along)
-        return section_residual.force_jacobian(model, free, value, tool, tube)
+    motion = Motion(s_c, displacement, blend=blend)
+    if model.level.closed is None:
+        if phi_c is not None:
+            along = jnp.asarray([1.0, 0.0], free.dtype)
+            motion = motion._replace(phi_c=phi_c, direction=along)
+        return forward_residual.force_jacobian(model, free, value, motion, tube)
     places = _Places(s_c[None], value[None], marked=False)
     of_lane = _skeleton_and_derivative(model, free[None], places, tube)
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
-    tool = _Tool(value, s_c, displacement, blend)
-    pressed = _press(model, tube, free, skeleton, by_beam, tool)
+    pressed = _press(model, tube, free, value, skeleton, by_beam, motion)
     return pressed.d_force + pressed.d_offset
 
 

@@ -28,13 +28,13 @@ from jaxtrachea.fitting.residual import Inputs, inputs, of_trials, residual
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
-from jaxtrachea.mechanics.press import respond
+from jaxtrachea.mechanics.levels.level import Closed, Motion
 from jaxtrachea.mechanics.softening import Softening
 
 #: Points of the parameter box, and half its width in decades.
 POINTS, DECADES = 8, 2.0
-#: Likewise of deforming cross-sections, so that the presses of the study have an equilibrium.
-DECADES_OF_SECTIONS = 0.3
+#: Likewise of a level without a closed form, so that its presses have an equilibrium.
+DECADES_OF_PATHS = 0.3
 #: Ratio of singular values, and part of an unknown in a direction, that are taken as zero.
 ZERO, NO_PART = 1e-7, 1e-3
 #: Lanes computed together.
@@ -83,11 +83,11 @@ def structure_of(study: Study, lanes: Bool[np.ndarray, " lanes"]) -> Structure:
 def suspicious(study: Study) -> Bool[np.ndarray, " lanes"]:
     """Lanes that may leave something open: a count of positions, which needs no program.
 
-    Of deforming cross-sections none: nothing is counted there. Whatever this misses shows in a
+    Of a level without a closed form none: nothing is counted there. Whatever this misses shows in a
     singular Jacobian at the estimate: one that is regular proves the full rank.
     """
     lanes = study.lanes
-    if study.model.options.deforms_sections:
+    if study.model.level.closed is None:
         return np.zeros(len(lanes.s_c), bool)
     beam = sum(p.name in SKELETON for p in study.free)
     places = positions(study)
@@ -231,8 +231,8 @@ def _joint_null_spaces(study: Study, J, active, nullity) -> list[np.ndarray]:
 
 def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
-    if study.model.options.deforms_sections:
-        return _seen_of_sections(study, lanes, theta)
+    if study.model.level.closed is None:
+        return _seen_of_curves(study, lanes, theta)
     J = map_lanes(_inputs_by_unknowns, without_curves(study), theta, rows=lanes, batch=_BATCH)
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
@@ -248,10 +248,10 @@ def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     return np.nan_to_num(J).reshape(len(lanes), -1, J.shape[-1])
 
 
-def _seen_of_sections(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
+def _seen_of_curves(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """Derivative of the curves themselves, every trial in its own natural measure.
 
-    No few numbers stand for a press on deforming cross-sections: what its samples tell is decided
+    No few numbers stand for a press without a closed form: what its samples tell is decided
     by number, at the displacements of the study, whatever they measured.
     """
     J = map_lanes(
@@ -303,7 +303,9 @@ def _nonlinear(x: Inputs) -> list[Array]:
 
 
 @made_once(maxsize=64)
-def _generic(options, higher: tuple[tuple[str, bool], ...], line: bool) -> Float[np.ndarray, "r n"]:
+def _generic(
+    closed: Closed, higher: tuple[tuple[str, bool], ...], line: bool
+) -> Float[np.ndarray, "r n"]:
     """See `_curve_sees`; of a model with these coefficients above k_1, or zero in their place.
 
     `line`: whether it has a slope of the force without contact; its curves then begin in the air.
@@ -316,7 +318,8 @@ def _generic(options, higher: tuple[tuple[str, bool], ...], line: bool) -> Float
         air = [-0.6, -0.4, -0.2] if line else []
         depths, c = jnp.asarray([*air, *_GENERIC_DEPTHS]), jnp.exp(v[0])
         softening = Softening(*bent) if bent else None
-        force = respond(depths, v[-2], c, law, options, softening=softening).force + v[-1]
+        motion = Motion(jnp.zeros(()), depths, onset=v[-2])
+        force = closed.respond(motion, c, law, softening).force + v[-1]
         return force + v[-3] * depths if line else force
 
     J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(4 + len(higher) + line)))
@@ -334,7 +337,9 @@ def _curve_sees(study: Study) -> Float[np.ndarray, "r n"]:
     Before the onset the slope of the force without contact, where the model has one.
     """
     line = any(p.name == "force_slope" for p in study.parameters)
-    return _generic(study.model.options, tuple(_higher(study).items()), line)
+    closed = study.model.level.closed
+    assert closed is not None
+    return _generic(closed, tuple(_higher(study).items()), line)
 
 
 def _higher(study: Study) -> dict[str, bool]:
@@ -358,8 +363,8 @@ def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes
     """One lane of every kind (all of a joint study), and the kind of each lane."""
     lanes = study.lanes
     count = len(lanes.s_c)
-    if study.joint or study.model.options.deforms_sections:
-        return np.arange(count), np.arange(count)  # of sections every displacement counts
+    if study.joint or study.model.level.closed is None:
+        return np.arange(count), np.arange(count)  # without a closed form every displacement counts
     marked = lanes.joint_precision
     parts = [lanes.s_c, lanes.index, lanes.value, lanes.active, lanes.lower, lanes.upper]
     parts.append((lanes.precision > 0).any(axis=2))
@@ -372,8 +377,7 @@ def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes
 
 def _points(study: Study) -> Float[np.ndarray, "lanes points P"]:
     """Generic points of every lane's box; shared unknowns are the same in all lanes."""
-    sections = study.model.options.deforms_sections
-    _, low, high = box(study, DECADES_OF_SECTIONS if sections else DECADES)
+    _, low, high = box(study, DECADES_OF_PATHS if study.model.level.closed is None else DECADES)
     unit = np.random.default_rng(20091).uniform(0.02, 0.98, (POINTS, study.size))
     return low[:, None] + unit * (high - low)[:, None]
 

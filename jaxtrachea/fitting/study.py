@@ -51,10 +51,11 @@ from jaxtrachea.fitting.parameters import (
 )
 from jaxtrachea.fitting.refusals import Size, check_noise, refusal
 from jaxtrachea.fitting.tested import depths
-from jaxtrachea.fitting.unread import along_the_normal
+from jaxtrachea.fitting.unread import as_read
 from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
-from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -210,26 +211,26 @@ class Study:
             raise ValueError(f"{what} needs lanes without shared unknowns; build with joint=False")
 
     def refuse_sections(self, what: str) -> None:
-        """Say that something is made for a line of joints.
+        """Say that something is too much work for a level that iterates.
 
         Raises:
-            ValueError: the skeleton is of deforming cross-sections.
+            ValueError: this one does.
         """
-        if self.model.options.deforms_sections:
+        if self.model.level.iterates:
             raise ValueError(
-                f"{what} is not available for the skeleton 'sections'; leave it out (standard "
-                "errors, profiles, the bootstrap, influence, leaving out and designs are), or "
-                "choose another skeleton"
+                f"{what} is not available for the skeleton {self.model.level.name!r}; leave it out "
+                "(standard errors, profiles, the bootstrap, influence, leaving out and designs "
+                "are), or choose another skeleton"
             )
 
     @property
     def one_at_a_time(self) -> bool:
         """Whether lanes are fitted one after the other, whatever batch is asked for.
 
-        Of deforming cross-sections on a CPU: lanes side by side gain nothing there, wait for the
+        Of a level that iterates on a CPU: lanes side by side gain nothing there, wait for the
         slowest of them, and each size is a program of half a minute.
         """
-        return self.model.options.deforms_sections and jax.default_backend() == "cpu"
+        return self.model.level.iterates and jax.default_backend() == "cpu"
 
     @property
     def bytes_per_lane(self) -> int:
@@ -349,7 +350,7 @@ def build_study(
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
         noise=noise, weighting=weighting, tool_radius=tool_radius,
-        vectors=options.deforms_sections,
+        vectors=level_of(options).off_midline,
     )  # fmt: skip
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
@@ -418,10 +419,9 @@ def _admitted(
     for curve in curves:
         if (refused := refusal(curve, size, options, table)) is not None:
             raise refused.error
-    if not options.deforms_sections:
-        curves, unread = along_the_normal(curves)
-        if unread is not None:
-            warnings.warn(unread, stacklevel=3)
+    curves, unread = as_read(curves, level_of(options))
+    if unread is not None:
+        warnings.warn(unread, stacklevel=3)
     return curves, table
 
 

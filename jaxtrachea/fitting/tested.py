@@ -6,13 +6,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.mechanics.press import TESTED, Options
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.line import TESTED
+from jaxtrachea.mechanics.levels.options import Options
 
 
 def tested_depth(options: Options, radius: float) -> float:
     """Depth to which the model was tested, mm; inf without a skeleton (coupling `total`)."""
-    # With what rounding takes.
-    return np.inf if options.coupling == "total" else TESTED[options.skeleton] * radius * (1 + 1e-9)
+    return level_of(options).tested * radius * (1 + 1e-9)  # with what rounding takes
 
 
 def depths(
@@ -64,10 +65,10 @@ def deeper_than_tested(
     if not deep:
         return None
     cure = "cut them off or leave them out where that matters"
-    if options.skeleton == "linear":
+    if level_of(options).tested < TESTED["softening"]:
         cure = "choose skeleton = 'softening' or 'sections'"
     return (
         f"{len(deep)} of {len(curves)} curves go to {max(deep):.3g} mm{counted}; skeleton = "
-        f"{options.skeleton!r} was tested to {most:.3g} mm ({TESTED[options.skeleton]:g} of the "
+        f"{options.skeleton!r} was tested to {most:.3g} mm ({level_of(options).tested:g} of the "
         f"radius), beyond it the model may be off by more than its bands say; {cure}"
     )

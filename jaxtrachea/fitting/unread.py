@@ -6,17 +6,21 @@ from collections.abc import Sequence
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.observed import VECTORS, WITHOUT_VECTORS
 from jaxtrachea.measurements.vectors import observed
+from jaxtrachea.mechanics.levels.level import Level
 
 
-def along_the_normal(curves: Sequence[Curve]) -> tuple[list[Curve], str | None]:
-    """Curves as a model reads them that knows motions and forces along the normal alone.
+def as_read(curves: Sequence[Curve], level: Level) -> tuple[Sequence[Curve], str | None]:
+    """Curves as a level reads them: without vectors where it presses along the normal alone.
 
     Args:
-        curves: presses along the normal.
+        curves: that the level admits.
+        level: of the model.
 
     Returns:
         The curves without their vectors, and a sentence on what was left out; None: nothing was.
     """
+    if level.off_midline:
+        return curves, None
     counts = {name: sum(observed(c, name) for c in curves) for name in VECTORS}
     counts = {name: count for name, count in counts.items() if count}
     plain = [

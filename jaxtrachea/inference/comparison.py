@@ -92,9 +92,10 @@ def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
         if study.model.loss != "linear" or first.model.loss != "linear":
             raise ValueError(f"fit.loss of {pair}: criteria need a likelihood; use 'linear'")
         if _curves(study) != _curves(first):
-            if len({s.model.options.deforms_sections for s in (study, first)}) > 1:
+            if len({s.model.level.observes for s in (study, first)}) > 1:
+                more = max(study, first, key=lambda s: len(s.model.level.observes)).model.level.name
                 raise ValueError(
-                    f"{pair} use different samples: skeleton 'sections' reads side forces, "
+                    f"{pair} use different samples: skeleton {more!r} reads side forces, "
                     "sideward markers, ring ends and presses off the midline, which the other does "
                     "not; compare them on presses along the normal, from a file without those"
                 )

@@ -38,7 +38,7 @@ from jaxtrachea.inference.labels import succeeded
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.
 _ALONE = 1e-9
-#: Lanes of deforming cross-sections together: second derivatives of their paths take memory.
+#: Lanes of a level that iterates together: second derivatives of their paths take memory.
 _TOGETHER = 16
 
 
@@ -230,14 +230,14 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
 
     Args:
         result: the fit.
-        batch: lanes computed together; of deforming cross-sections no more than `_TOGETHER`.
+        batch: lanes computed together; of a level that iterates no more than `_TOGETHER`.
 
     Raises:
         ValueError: no `FitResult`, or `batch` is no whole number.
     """
     check_word("result", result, FitResult)
     check_word("batch", batch, int)
-    if result.study.model.options.deforms_sections:
+    if result.study.model.level.iterates:
         batch = min(batch, _TOGETHER)
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import full_precision
+from jaxtrachea.fitting.forward_residual import answer
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import material_and_values
-from jaxtrachea.fitting.section_residual import Tool, answer
-from jaxtrachea.mechanics.press import press
+from jaxtrachea.mechanics.levels.level import Motion
 
 #: Slope along a direction of the null space, over what its terms add up to, from which it counts.
 _ACTS = 1e-6
@@ -25,8 +24,8 @@ class Response(NamedTuple):
 
     Attributes:
         force: at the load cell, with its offset, N; (N,).
-        joints: deflection of the ligament at each ring, mm; of deforming cross-sections that of the
-            outer surface at the contact's angle, along the inward normal; (N, rings).
+        joints: deflection of the ligament at each ring, mm; of cross-sections that of the outer
+            surface at the contact's angle, along the inward normal; (N, rings).
         reactions: force of each ring against the load, N; (N, rings). None of deforming
             cross-sections, whose rings stand on a bed.
         side_force: of deforming cross-sections, N, see `Curve`; (N,).
@@ -41,7 +40,7 @@ class Response(NamedTuple):
 
 
 class Aside(NamedTuple):
-    """Where a press is beside the position along the tube; deforming cross-sections only.
+    """Where a press is beside the position along the tube; of a level that presses there.
 
     Attributes:
         phi_c: angle from the anterior midline, rad.
@@ -110,27 +109,11 @@ def respond(
             options.
         aside: off the midline, or not along the normal; None: neither.
     """
-    if model.options.deforms_sections:
-        return _respond_sections(model, free, value, s_c, displacement, aside)
-    material, values = material_and_values(model, free, value)
-    geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
-    solved = press(
-        geometry, material, s_c, displacement, model.options,
-        onset=values["onset"], blend=blend,
-    )  # fmt: skip
-    force = solved.force + values["force_offset"]
-    if "force_slope" in values:
-        force = force + values["force_slope"] * displacement
-    return Response(force, solved.joints, solved.reactions), solved.status
-
-
-def _respond_sections(model: FitModel, free, value, s_c, displacement, aside: Aside | None):
-    """As `respond`, on deforming cross-sections."""
     tube = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
-    tool = Tool(s_c, displacement, *(aside or ()))
-    found, status = answer(model, free, value, tool, tube)
-    given = {name: getattr(found, name) for name in ("force", "joints", "side_force", "joint_side")}
-    return Response(reactions=None, **given), status
+    phi_c, direction = aside or (None, None)
+    motion = Motion(s_c, displacement, blend=blend, phi_c=phi_c, direction=direction)
+    found = answer(model, free, value, motion, tube)
+    return Response(*(getattr(found, name) for name in Response._fields)), found.status
 
 
 def jacobian(model: FitModel, free, value, s_c, displacement, blend=None, aside=None):
@@ -222,7 +205,7 @@ def predicted(
         end, _ = respond(model, free + sign * step, value, s_c, displacement, blend, aside)
         return end.force - out.force - sign * straight
 
-    if model.options.deforms_sections:  # one program for both: it is long to compile
+    if model.level.iterates:  # one program for both: it is long to compile
         bends = jax.vmap(bend)(jnp.asarray([1.0, -1.0], free.dtype))
     else:
         bends = jnp.stack([bend(1.0), bend(-1.0)])

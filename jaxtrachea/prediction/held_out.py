@@ -143,7 +143,7 @@ def compare(
     sources = with_own(stored, sources, curves, sigmas)
     s = [np.nan if c.s_c is None else c.s_c for c in curves]
     aside = None
-    if stored.study.model.options.deforms_sections:
+    if stored.study.model.level.off_midline:
         aside = [(c.phi_c, (c.direction[0], c.direction[1])) for c in curves]
     depths = [c.displacement for c in curves]
     found = predict_sources(stored, sources, s, depths, sigmas, aside=aside)

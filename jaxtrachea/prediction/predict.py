@@ -19,10 +19,10 @@ from jaxtyping import ArrayLike
 
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.onset import counted_from
+from jaxtrachea.fitting.parameters import DECLARED
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.tested import depths, untested
 from jaxtrachea.measurements.vectors import tilt_of
-from jaxtrachea.mechanics.sections.press import tested_angle
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
@@ -30,6 +30,8 @@ from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import Source, onset_of, slack_of, source_of, value_of
 from jaxtrachea.status import PredictionStatus, PressStatus
 
+#: Parts of parameters that say nothing of a skeleton.
+AT_CONTACT = ("contact", "press")
 #: Error of the linear band at its ends, in half-widths, from which it is called bent.
 BENT = 0.5
 
@@ -263,8 +265,7 @@ def _on_host(stored: FitResult, source: Source, where, displacement, part: Predi
     def hide(v):
         return v if usable else np.full_like(v, np.nan)
 
-    sections = stored.study.model.options.deforms_sections
-    skeleton = sections or any(p.name == "k_M" for p in stored.study.parameters)
+    skeleton = any(DECLARED[p.name].part not in AT_CONTACT for p in stored.study.parameters)
 
     def show(v):
         return hide(v) if skeleton else np.full_like(v, np.nan)
@@ -448,7 +449,7 @@ def check_aside(results: FitResult, phi: float, direction: tuple[float, float]) 
         ValueError: with what is expected.
     """
     model = results.study.model
-    if not model.options.deforms_sections:
+    if not model.level.off_midline:
         if phi != 0 or tuple(direction) != (1.0, 0.0):
             raise ValueError(
                 "this fit presses on the anterior midline along the normal; phi and direction "
@@ -461,7 +462,7 @@ def check_aside(results: FitResult, phi: float, direction: tuple[float, float]) 
             f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is not on the cartilage; expected "
             f"within {alpha:.4g} rad ({np.degrees(alpha):.4g} deg)"
         )
-    if not abs(phi) <= (most := float(tested_angle(alpha)) + 1e-6):
+    if not abs(phi) <= (most := model.level.tested_angle(alpha)):
         raise ValueError(
             f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is too near to the ends of the rings, "
             f"where the model is too stiff; expected within {most:.4g} rad "

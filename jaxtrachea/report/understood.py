@@ -9,7 +9,8 @@ from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Share of the tube's length that measured positions leave free at an end, from which a tube that
@@ -136,8 +137,7 @@ def model_words(options: Options) -> str:
         parts = ["no skeleton (coupling = 'total')"]
     else:
         parts = [f"skeleton {options.skeleton}"]
-        if not options.deforms_sections:
-            parts.append("with shear" if options.shear else "without shear")
+        parts += level_of(options).parts
         parts.append("indentation and skeleton in series")
     parts.append("local law two-material" if options.local == "two-material" else
                  "one local law everywhere")  # fmt: skip

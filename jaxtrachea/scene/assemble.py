@@ -139,7 +139,7 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
     the scene by hand leaves the surface on the old rings.)
     """
     binding = None
-    if scene.mesh is not None and not scene.plan.options.deforms_sections:
+    if scene.mesh is not None and scene.plan.mechanics.hangs_on_rings:
         binding = regions.bind(scene.mesh, geometry, scene.binding)
     return dataclasses.replace(scene, geometry=geometry, binding=binding)
 
@@ -188,12 +188,12 @@ def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
     """
     curved = scene.plan.contact and mesh.frames is not None
     plan = dataclasses.replace(scene.plan, curved=curved)
-    sections, tube, binding = scene.plan.options.deforms_sections, scene.tube, None
-    if tube is not None and not (sections and mesh.frames is None):
+    bound, tube, binding = scene.plan.mechanics.hangs_on_rings, scene.tube, None
+    if tube is not None and (bound or mesh.frames is not None):
         tube = checked_walls(scene.geometry, mesh)
-    if not sections:
+    if bound:
         binding = regions.bind(mesh, scene.geometry)
     return dataclasses.replace(
         scene, mesh=mesh, binding=binding, tube=tube, plan=plan,
-        runs=local.runs(mesh.s, scene.footprint), points=_points(mesh) if sections else None,
+        runs=local.runs(mesh.s, scene.footprint), points=None if bound else _points(mesh),
     )  # fmt: skip

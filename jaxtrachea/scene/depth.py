@@ -6,7 +6,8 @@ strain: a linear skeleton errs there by 1.4 % at R / 100 and by 13 % at R / 10. 
 pinched between two points, is off by 15 % at R / 4 (`ranges.DEEPEST`).
 """
 
-from jaxtrachea.mechanics.press import TESTED, Options
+from jaxtrachea.mechanics.levels import line, sections
+from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.scene.declare import SECTIONS, Case, PlanError, Verdict
 from jaxtrachea.trachea.material import DEEP
 
@@ -45,13 +46,13 @@ def departure(softness, way):
     return way * (e_1 + e_2 * way)
 
 
-def _untested(level: str, share: float) -> str:
+def _untested(tested: float, share: float) -> str:
     """A doubt where the wall is moved further than the skeleton was tested; else empty."""
-    if share <= TESTED[level]:
+    if share <= tested:
         return ""
     return (
         f"but the wall is moved by {100 * share:.2g} % of the radius, and it was tested to "
-        f"{100 * TESTED[level]:g} %"
+        f"{100 * tested:g} %"
     )
 
 
@@ -92,11 +93,11 @@ def skeleton(case: Case) -> Verdict:
         return Verdict("linear", f"{far}: {_LITTLE}", refused)
     if not cannot:
         why = f"{far}, and e_1 and e_2 are given"
-        return Verdict("softening", why, refused, doubt=_untested("softening", share))
+        return Verdict("softening", why, refused, doubt=_untested(line.TESTED["softening"], share))
     if given and case.options.skeleton == "auto":
         raise PlanError("skeleton", "'auto'", f"{far}, and {cannot}", cure)
     doubt = ""
-    if share > TESTED["linear"]:
+    if share > line.TESTED["linear"]:
         doubt = f"but {far}: {_TOO_STIFF}; {_MIDLINE}"
     return Verdict("linear", f"{far}; {cannot}", refused, doubt=doubt)
 
@@ -126,4 +127,4 @@ def _sections(case: Case) -> Verdict:
         cure = "set contact = 'bonded' and no other key of [model]"
         raise PlanError("skeleton", "'sections'", str(error), cure) from None
     why = "the material is that of deforming cross-sections"
-    return Verdict("sections", why, refused, doubt=_untested("sections", reached(case)))
+    return Verdict("sections", why, refused, doubt=_untested(sections.TESTED, reached(case)))

@@ -9,8 +9,10 @@ from typing import Any, Literal, get_args
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea._errors import InputError
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.level import Level
+from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.oblique import ObliqueOptions
-from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.skeleton import Rings
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.surface.regions import Method
@@ -154,6 +156,11 @@ class Plan:
                 "is 'sections', with contact_point 'per_step' of a tool", key="options.skeleton",
                 joint=" ", expected="contact_point 'fixed', or presses at given points",
             )  # fmt: skip
+
+    @property
+    def mechanics(self) -> Level:
+        """The level of the mechanics that the options ask for."""
+        return level_of(self.options)
 
     @property
     def oblique(self) -> ObliqueOptions:

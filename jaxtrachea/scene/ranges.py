@@ -71,7 +71,7 @@ def unserved(
     given = not plan.contact
     if not plan.second_plane:
         found.append(off_midline(presses.phi) | axial(motion) | lateral(motion))
-    elif plan.options.deforms_sections:
+    elif not plan.mechanics.follows_axial:
         found.append(axial(motion))
     elif "axial" in less and (given or plan.contact_point == "fixed"):
         found.append(axial(motion))
@@ -153,7 +153,7 @@ def _frictionless(scene: Scene) -> bool:
 def depth_share(scene: Scene, depth, skeleton, inward):
     """Inward motion of the wall at the contact (indentation and skeleton) over the tube's radius.
 
-    That of the outside, on deforming cross-sections of their mid-line. Motion outwards counts as 0,
+    By the radius of the level (`wall_radius`). Motion outwards counts as 0,
     motion along the surface as nothing.
 
     Args:
@@ -163,7 +163,7 @@ def depth_share(scene: Scene, depth, skeleton, inward):
         inward: inward normal of the tube at the contact; likewise.
     """
     way = jnp.sum((depth + skeleton) * inward, axis=-1)
-    radius = scene.geometry.radius if scene.plan.options.deforms_sections else scene.radius
+    radius = scene.plan.mechanics.wall_radius(scene.geometry, scene.radius)
     return jax.lax.stop_gradient(jnp.maximum(way, 0) / radius)
 
 

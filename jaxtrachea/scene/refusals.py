@@ -51,7 +51,7 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
     behind the ends of the rings it is computed as no motion, on the midline; off the tube at its
     end. Refused rows of a line of joints are computed as no motion, too, and their results hidden
     (`hide`): by 0 times NaN they would reach the derivatives of other rows by the geometry. With
-    friction they are NaN, since what follows goes on from them; deforming cross-sections see to it.
+    friction they are NaN, since what follows goes on from them; a level may see to it itself.
     """
     presses = path if made is None else made.presses
     assert presses is not None
@@ -92,7 +92,7 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
 
 def at_rest(scene: Scene) -> bool:
     """Whether refused rows are computed as no motion, see `refuse`."""
-    return not (scene.plan.friction or scene.plan.options.deforms_sections)
+    return not (scene.plan.friction or scene.plan.mechanics.hides_refused)
 
 
 def hidden_rows(

@@ -108,7 +108,7 @@ def check_scene(scene: Scene, material: AnyMaterial) -> None:
     """
     if not scene.plan.contact or scene.tool is None:
         raise ValueError("the plan has no contact; make the scene with a path of Poses")
-    if isinstance(material, SectionMaterial) or scene.plan.options.deforms_sections:
+    if isinstance(material, SectionMaterial) or not scene.plan.mechanics.stepwise:
         raise ValueError(
             "a session has no skeleton 'sections'; use simulate, or make the scene with the "
             "Material of a line of joints"

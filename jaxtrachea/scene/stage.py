@@ -25,7 +25,7 @@ from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import DEEP
+from jaxtrachea.trachea.material import DEEP, Material
 from jaxtrachea.trachea.mesh import Mesh
 
 
@@ -105,10 +105,12 @@ def check_kind(scene: "Scene", material: AnyMaterial) -> None:
     Raises:
         ValueError: what was expected.
     """
-    sections = scene.plan.options.deforms_sections
-    if sections != isinstance(material, SectionMaterial):
-        kinds = ("Material", "SectionMaterial (the plan has a skeleton 'sections')")
-        raise ValueError(f"material is {type(material).__name__}; expected {kinds[sections]}")
+    level = scene.plan.mechanics
+    if not isinstance(material, level.material_type):
+        expected = level.material_type.__name__
+        if level.material_type is not Material:
+            expected += f" (the plan has a skeleton {level.name!r})"
+        raise ValueError(f"material is {type(material).__name__}; expected {expected}")
 
 
 def check_path(path: Presses | Poses) -> None:

@@ -10,10 +10,9 @@ from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.tested import depths, untested
-from jaxtrachea.mechanics.sections.press import tested_angle
 
-#: Candidates where the user does not say: of deforming cross-sections, and of a line of joints,
-#: which cost next to nothing.
+#: Candidates where the user does not say: of a level that iterates, and of a formula, which costs
+#: next to nothing.
 _FEW, _MANY = 250, 10_000
 
 
@@ -161,19 +160,19 @@ def candidates_of(
             f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm"
             f"{tool if low > 0 else ''}; give places on it"
         )
-    sections = study.model.options.deforms_sections
-    radius = float(study.model.geometry.radius)
-    if sections:
-        deepest = min(deepest, radius)
+    level, radius = study.model.level, float(study.model.geometry.radius)
+    deepest = min(deepest, level.deepest(radius))
     depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
     # Without a skeleton the specimen need not be a tube.
-    limited = sections or study.model.options.coupling == "series"
+    limited = study.model.options.coupling == "series"
     if section.depth is not None and limited and depth[1] > radius:
         raise SpecError(
             f"design.depth: {depth[1]:g} mm, a tube is pressed no deeper than its radius, expected "
             f"at most {radius:g} mm; give less (trachea.radius is that of the tube)"
         )
-    count = (_FEW if sections else _MANY) if section.candidates is None else section.candidates
+    count = (
+        (_FEW if level.iterates else _MANY) if section.candidates is None else section.candidates
+    )
     return grid(s, depth, count, _angles(section.phi, study), pressed_curves(study))
 
 
@@ -183,7 +182,7 @@ def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
     Raises:
         SpecError: one that the model does not press.
     """
-    if not study.model.options.deforms_sections:
+    if not study.model.level.off_midline:
         if asked is not None:
             raise SpecError(
                 "design.phi: this model presses on the midline alone; leave it out, or choose "
@@ -193,7 +192,7 @@ def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
     if asked is None:
         measured = (c.phi_c for curves in study.curves for c in curves)
         return sorted({round(float(phi), 9) + 0.0 for phi in measured})
-    reach = float(tested_angle(float(study.model.geometry.half_angle))) + 1e-6
+    reach = study.model.level.tested_angle(float(study.model.geometry.half_angle))
     for phi in asked:
         if not abs(phi) <= reach:
             raise SpecError(

@@ -52,7 +52,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
         ValueError: angles for a skeleton that is pressed on the midline alone.
     """
     study = known.study
-    if candidates.phi is not None and not study.model.options.deforms_sections:
+    if candidates.phi is not None and not study.model.level.off_midline:
         raise ValueError("presses off the midline need the skeleton 'sections'; leave phi out")
     parts = []
     curve = np.zeros(len(candidates.s), int) if candidates.curve is None else candidates.curve

@@ -12,7 +12,7 @@ from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.programs import program
 
-#: Presses of deforming cross-sections that are computed at a time.
+#: Presses of a level that iterates that are computed at a time.
 _TOGETHER = 16
 
 
@@ -132,14 +132,14 @@ class Place(NamedTuple):
 def press_informations(
     study: Study, samples: int, guess: Guess, places: Place
 ) -> Float[np.ndarray, "C P P"]:
-    """Information of presses with noise of 1 N; of deforming cross-sections so many at a time.
+    """Information of presses with noise of 1 N; of a level that iterates so many at a time.
 
     Each is a path of its own there, and all together would take the memory.
     """
     sides = study.lanes.side_force is not None
     run = program(_information, study.model, samples, sides, axes=(None, 0))
     count = len(places.s)
-    together = _TOGETHER if study.model.options.deforms_sections else count
+    together = _TOGETHER if study.model.level.iterates else count
     parts = []
     for first in range(0, count, together):
         row = np.minimum(np.arange(first, first + together), count - 1)

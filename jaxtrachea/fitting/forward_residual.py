@@ -1,71 +1,20 @@
-"""Model minus data of a lane whose skeleton is of deforming cross-sections (`mechanics.sections`).
+"""Model minus data of a lane whose level has no closed form: `Level.response`, trial by trial.
 
 Every trial is pressed along its own path. The Jacobian is that of the equilibria by the free
 columns, in forward mode: one path for all columns. A sample without equilibrium is NaN, which makes
 the cost infinite wherever that sample is observed.
 """
 
-import dataclasses
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.lane import Lane, forces, markers, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
-from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.sections.press import press_sections
-from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.mechanics.levels.level import Motion, Response
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
-
-
-class Tool(NamedTuple):
-    """Where and how a trial presses; `phi_c` and `direction` None: on the midline, normally.
-
-    Attributes:
-        s_c: mm.
-        displacement: as measured, mm; (N,).
-        phi_c: rad.
-        direction: along the inward normal and the circumference; (2,).
-    """
-
-    s_c: Float[Array, ""]
-    displacement: Float[Array, " N"]
-    phi_c: Float[Array, ""] | None = None
-    direction: Float[Array, "2"] | None = None
-
-
-class Answer(NamedTuple):
-    """What can be observed of a press; the fields of a `Lane` of these names, without T.
-
-    Attributes:
-        force: along the tool's direction, with the offset, N.
-        side_force: along that direction turned by 90 degrees, N.
-        joints: of every ring at phi_c along the inward normal, mm.
-        joint_side: likewise along the circumference.
-        ends: of every ring's ends U and V, each y and z, mm.
-    """
-
-    force: Float[Array, " N"]
-    side_force: Float[Array, " N"]
-    joints: Float[Array, "N rings"]
-    joint_side: Float[Array, "N rings"]
-    ends: Float[Array, "N rings 2 2"]
-
-
-def section_material(
-    model: FitModel, free: Float[Array, " Jf"], value: Float[Array, " J"]
-) -> tuple[SectionMaterial, dict[str, Array]]:
-    """Material of one trial, and the value of every parameter by name.
-
-    Results of a fit made before a parameter was there do not have it: then it is its default.
-    """
-    values = values_of(model, free, value)
-    names = [field.name for field in dataclasses.fields(SectionMaterial) if field.name in values]
-    return SectionMaterial(**{name: values[name] for name in names}), values
 
 
 @full_precision
@@ -73,35 +22,25 @@ def answer(
     model: FitModel,
     free: Float[Array, " Jf"],
     value: Float[Array, " J"],
-    tool: Tool,
+    motion: Motion,
     tube: Geometry,
-) -> tuple[Answer, Int[Array, " N"]]:
-    """What the model shows in one trial, and the `PressStatus` of each sample.
+) -> Response:
+    """What the model shows in one trial, its force as the load cell records it.
 
     Args:
         model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
-        tool: where and how it presses.
+        motion: of the tool; its onset is that of the parameters.
         tube: the geometry.
     """
-    material, values = section_material(model, free, value)
-    plain = tool.phi_c is None or tool.direction is None
-    phi_c = jnp.zeros_like(tool.s_c) if tool.phi_c is None else tool.phi_c
-    along = jnp.asarray([1.0, 0.0], free.dtype) if tool.direction is None else tool.direction
-    moved = tool.displacement - values["onset"]
-    pressed = press_sections(tube, material, tool.s_c, phi_c, moved, along, midline=plain)
-    frame = local_frame(phi_c)[::2]  # inward normal, circumference
-    force, joints = pressed.force @ frame.T, pressed.joints @ frame.T
-    across = jnp.stack([-along[1], along[0]])
-    found = Answer(
-        force=force @ along + values["force_offset"],
-        side_force=force @ across,
-        joints=joints[..., 0],
-        joint_side=joints[..., 1],
-        ends=jnp.stack([pressed.end_U[..., 1:], pressed.end_V[..., 1:]], axis=2),
-    )
-    return found, pressed.status
+    values = values_of(model, free, value)
+    moved = motion._replace(onset=values["onset"])
+    found = model.level.response(tube, model.level.material(values), moved)
+    force = found.force + values["force_offset"]
+    if "force_slope" in values:
+        force = force + values["force_slope"] * motion.displacement
+    return found._replace(force=force)
 
 
 def residual(
@@ -142,7 +81,7 @@ def force_jacobian(
     model: FitModel,
     free: Float[Array, " Jf"],
     value: Float[Array, " J"],
-    tool: Tool,
+    motion: Motion,
     tube: Geometry,
 ) -> Float[Array, "Jf m"]:
     """Derivative of the forces by the free columns, of a press without data.
@@ -152,10 +91,11 @@ def force_jacobian(
     """
 
     def at(free):
-        found, status = answer(model, free, value, tool, tube)
-        if tool.phi_c is None:
-            return found.force, status
-        return jnp.concatenate([found.force, found.side_force]), jnp.concatenate([status] * 2)
+        found = answer(model, free, value, motion, tube)
+        if motion.phi_c is None or found.side_force is None:
+            return found.force, found.status
+        both = jnp.concatenate([found.force, found.side_force])
+        return both, jnp.concatenate([found.status] * 2)
 
     def push(tangent):
         _, slope, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
@@ -176,8 +116,8 @@ def _seen(model: FitModel, free, trial: Lane, tube: Geometry) -> list[Array]:
     )
     onset = values_of(model, free, trial.value)["onset"]
     D = jnp.where(looked, trial.displacement, onset)
-    tool = Tool(trial.s_c, D, trial.phi_c, trial.direction)
-    found, _ = answer(model, free, trial.value, tool, tube)
+    motion = Motion(trial.s_c, D, blend=trial.blend, phi_c=trial.phi_c, direction=trial.direction)
+    found = answer(model, free, trial.value, motion, tube)
     return [getattr(found, kind.name) for kind in kinds]
 
 

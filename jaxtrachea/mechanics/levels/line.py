@@ -1,0 +1,160 @@
+"""The beam levels: a line of joints on the rings, with softening, width and shear as its parts."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea._errors import InputError
+from jaxtrachea.mechanics import press as _press
+from jaxtrachea.mechanics.equilibrium import Equilibrium
+from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
+from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.softening import Softening
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import OF_PRESS, VALUES, Material, material_of
+
+#: Depth to which a skeleton was compared with finite elements, in radii of the tube
+#: (docs/evidence/virtual_trachea.md). At a tenth that specimen yields 13 % more than a linear skeleton; the
+#: others were pressed to half.
+TESTED = {"linear": 0.1, "softening": 0.5}
+#: Parameters of the beam; all others of a line act at the contact.
+OF_BEAM = tuple(
+    name for name, p in VALUES.items()
+    if p.fit is not None and p.part == "skeleton" and p.needs in ("", "shear")
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Line(Level):
+    """The ligament as a beam on springs, pressed on the midline along the normal.
+
+    Attributes:
+        options: its parts, the local law and the contact.
+    """
+
+    options: Options
+    observes: ClassVar = frozenset({"force", "joints"})
+    declares: ClassVar = VALUES
+    material_type: ClassVar = Material
+
+    @property
+    def name(self) -> str:
+        """`linear` or `softening`."""
+        return self.options.skeleton
+
+    @property
+    def tested(self) -> float:
+        """See `TESTED`; without limit where the force knows no skeleton."""
+        return np.inf if self.options.coupling == "total" else TESTED[self.name]
+
+    @property
+    def closed(self) -> "Line":
+        """Itself."""
+        return self
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Whether it shears."""
+        return ("with shear" if self.options.shear else "without shear",)
+
+    def needs(self, *, joints: bool) -> frozenset[str]:
+        """With coupling `total` and no markers the skeleton does not enter.
+
+        Force-displacement curves then see the local law alone.
+        """
+        o = self.options
+        has = {"": True, "shear": o.shear, "two-material": o.local == "two-material",
+               "softening": o.skeleton == "softening"}  # fmt: skip
+        names = {n for n, p in (VALUES | OF_PRESS).items() if p.fit and has.get(p.needs, False)}
+        if o.coupling == "total" and not joints:
+            names -= set(OF_BEAM)
+        if o.contact == "bonded":  # no record of it has air, where alone a line shows
+            names -= {"force_slope"}
+        return frozenset(names)
+
+    def admits(self, curve: Record, size: Size, onset: float = 0.0) -> InputError | None:
+        """All of the tool on the tube, on the midline and along the normal."""
+        if curve.s_c is not None:
+            low, high = self.options.places(size.length)
+            if not low <= curve.s_c <= high:
+                return self._off_the_end(curve.s_c, size.length)
+        cure = "choose skeleton = 'sections' and contact = 'bonded', or leave the curve out"
+        if self.options.coupling == "series" and abs(curve.phi_c) > 1e-6:
+            return InputError(
+                f"contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on the "
+                "anterior midline (phi = 0) only",
+                cure=cure,
+            )
+        if abs(curve.direction[1]) > 1e-6:
+            shown = ", ".join(f"{v:.4g}" for v in curve.direction)
+            return InputError(
+                f"the tool moves in the direction ({shown}); this model presses along the inward "
+                "normal (1, 0) only",
+                cure=cure,
+            )
+        return None
+
+    def _off_the_end(self, s_c: float, length: float) -> InputError:
+        low, high = self.options.places(length)
+        expected = f"s from {low:g} to {high:g} mm"
+        if low > high:
+            expected = f"a tool no wider than the tube is long, {length:g} mm"
+        return InputError(
+            f"contact at s = {s_c:g} mm, where a tool of half_width {self.options.half_width:g} mm "
+            "reaches beyond an end of the tube",
+            expected=expected,
+            cure="leave the curve out, or make half_width smaller (0: the tool touches at a point)",
+        )
+
+    def material(self, values: Mapping[str, Array]) -> Material:
+        """1 stands for a skeleton that is not part of the model."""
+        one = jnp.ones((), values["onset"].dtype)
+        return material_of({"EI_L": one, "k_M": one} | dict(values))
+
+    def response(self, tube: Geometry, material: Material, motion: Motion) -> Response:
+        """See `press.press`; angle and direction of the motion are not read."""
+        found = _press.press(
+            tube, material, motion.s_c, motion.displacement, self.options,
+            onset=motion.onset, blend=motion.blend,
+        )  # fmt: skip
+        return Response(found.force, found.joints, found.status, reactions=found.reactions)
+
+    def skeleton(
+        self, tube: Geometry, material: Material, s_c: Float[Array, "*m"], *, joints: bool
+    ) -> tuple[Float[Array, "*m"], Float[Array, "*m rings"] | None]:
+        """See `Closed`; with `joints` at one position."""
+        if not joints:
+            return _press.compliance(tube, material, s_c, self.options), None
+        beam = _press.ligament_beam(tube, material, self.options)
+        unit = _press.unit_deflection(beam, s_c, self.options)
+        return unit.w_C, unit.w
+
+    def local(
+        self, tube: Geometry, material: Material, s_c: Float[Array, ""]
+    ) -> tuple[Law, Softening | None]:
+        """See `Closed`."""
+        law = _press.local_law(tube, material, s_c, self.options)
+        return law, _press.softening_of(material, self.options)
+
+    def felt(self, compliance: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """None with the paper's total coupling."""
+        return compliance if self.options.coupling == "series" else jnp.zeros_like(compliance)
+
+    def touch(self, displacement: Any, onset: Any, blend: Any = None) -> Any:
+        """See `press.touch`."""
+        return _press.touch(displacement, onset, self.options, blend)
+
+    def respond(
+        self, motion: Motion, compliance: Any, law: Law, softening: Softening | None
+    ) -> Equilibrium:
+        """See `press.respond`."""
+        assert motion.onset is not None
+        return _press.respond(
+            motion.displacement, motion.onset, compliance, law, self.options, motion.blend,
+            softening,
+        )  # fmt: skip

@@ -1,0 +1,193 @@
+"""A level is an object: every one answers the same questions, and nobody asks which it is."""
+
+import ast
+import dataclasses
+import functools
+import pathlib
+from typing import get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtrachea
+from jaxtrachea.config import ModelSection
+from jaxtrachea.fitting import forward_residual
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.parameters import DECLARED, DEFAULTS, in_model
+from jaxtrachea.fitting.residual import of_press, of_trials, residual
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.levels.choose import LEVELS, level_of
+from jaxtrachea.mechanics.levels.level import Level, Motion, Response, Size
+from jaxtrachea.mechanics.levels.options import Options, Skeleton
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import Geometry
+
+PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
+QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
+GEOMETRY = Geometry.create(60.0, [15.0, 30.0, 45.0], radius=11.7)
+SIZE = Size.of(GEOMETRY)
+FREE = {"fixed": False, "scope": "specimen"}
+BOTH = {"onset": FREE, "force_offset": FREE}
+
+
+def options_of(word):
+    return Options(skeleton=word, contact="bonded" if word == "sections" else "unilateral")
+
+
+def curve(s=20.0, **changes):
+    D = np.linspace(0.0, 3.0, 6)
+    fields = {"displacement": D, "force": 0.3 * D, "s_c": s, "phi_c": 0.0}
+    return Curve(**{"specimen": "one", "trial": f"s{s:g}"} | fields | changes)
+
+
+@pytest.fixture(params=LEVELS)
+def word(request):
+    return request.param
+
+
+def test_every_word_is_a_level(word):
+    assert set(LEVELS) == set(get_args(Skeleton))
+    assert set(LEVELS) == set(get_args(ModelSection.model_fields["skeleton"].annotation))
+    level = level_of(options_of(word))
+    assert isinstance(level, Level)
+    assert level.name == word
+    assert level_of(options_of(word)) is level
+    assert hash(level) == hash(LEVELS[word](options_of(word)))
+
+
+def test_parameters_are_declared(word):
+    """All that a level needs can be fitted, and is its own or of the press."""
+    level = level_of(options_of(word))
+    for joints in (False, True):
+        names = in_model(options_of(word), joints=joints, named=DECLARED)
+        assert set(names) == level.needs(joints=joints)
+        assert {"onset", "force_offset"} <= set(names)
+        assert all(n in level.declares or DECLARED[n].part == "press" for n in names)
+
+
+def test_a_response_has_what_is_observed(word):
+    """Each observed field is there, of one shape, and nothing else that can be measured."""
+    level = level_of(options_of(word))
+    values = {n: jnp.asarray(DEFAULTS[n].value) for n in level.needs(joints=True)}
+    motion = Motion(jnp.asarray(20.0), jnp.array([0.0, 0.5]), onset=jnp.asarray(0.0))
+    press = functools.partial(level.response, GEOMETRY)
+    found = jax.eval_shape(lambda v: press(level.material(v), motion), values)
+    assert isinstance(found, Response)
+    shapes = {"force": (2,), "side_force": (2,), "joints": (2, 3), "joint_side": (2, 3),
+              "ends": (2, 3, 2, 2)}  # fmt: skip
+    for name, shape in shapes.items():
+        value = getattr(found, name)
+        assert (value is not None) == (name in level.observes), name
+        assert value is None or value.shape == shape
+    assert found.status.shape == (2,)
+
+
+def test_what_a_level_presses_it_admits(word):
+    level = level_of(options_of(word))
+    aside = curve(phi_c=0.5, direction=(0.8, 0.6))
+    assert level.admits(curve(), SIZE) is None
+    assert (level.admits(aside, SIZE) is None) == level.off_midline
+    assert (level.tested_angle(SIZE.half_angle) > 0.5) == level.off_midline
+    deep = curve(displacement=np.linspace(0, 13, 6))
+    assert (level.admits(deep, SIZE) is None) == (level.deepest(SIZE.radius) > 13)
+    assert level.admits(deep, SIZE, onset=5.0) is None
+
+
+@pytest.mark.compiling
+@pytest.mark.parametrize(
+    ("options", "changes"),
+    [
+        (Options(), BOTH),
+        (Options(skeleton="softening", shear=True, half_width=2.0), {}),
+        (Options(coupling="total"), {}),
+    ],
+    ids=["onset", "softening punch", "total"],
+)
+def test_a_closed_form_is_what_the_response_gives(options, changes):
+    """Two ways to one residual and Jacobian: few inputs, and forward mode through `response`."""
+    moved = 0.1 * np.linspace(0, 1, 12).reshape(6, 2)
+    marked = {"joint_rings": np.array([0, 2]), "joint_displacement": moved}
+    curves = [curve(s, **marked) for s in (12.0, 20.0, 33.0)]
+    study = build_study(curves, GEOMETRY, options, changes, noise=Noise(force=0.1, joints=0.2))
+    lane = jax.tree.map(lambda v: jnp.asarray(v[0]), study.lanes)
+    theta = jnp.array([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]]) + 0.1
+    assert study.model.level.closed is not None
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def both(theta, lane):
+        free = of_trials(study.model, theta, lane)
+        plain = forward_residual.residual(study.model, free, of_press(lane), GEOMETRY)
+        return residual(study.model, theta, lane)[:2], plain
+
+    (value, jacobian), (plain, slopes) = both(theta, lane)
+    assert np.abs(jacobian).max() > 0.1
+    np.testing.assert_allclose(value, plain, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(jacobian, slopes, rtol=1e-9, atol=1e-9)
+
+
+@dataclasses.dataclass(frozen=True)
+class Half(Level):
+    """A wrapper, as one for time is: half the force of the level within."""
+
+    within: Level
+    observes = frozenset({"force", "joints"})
+    declares = property(lambda self: self.within.declares)
+    material_type = property(lambda self: self.within.material_type)
+    name = tested = property(lambda self: 0.1)
+
+    def needs(self, *, joints):
+        return self.within.needs(joints=joints)
+
+    def admits(self, curve, size, onset=0.0):
+        return self.within.admits(curve, size, onset)
+
+    def material(self, values):
+        return self.within.material(values)
+
+    def response(self, tube, material, motion):
+        found = self.within.response(tube, material, motion)
+        return found._replace(force=found.force / 2)
+
+
+@pytest.mark.compiling
+def test_a_level_that_wraps_another_needs_no_word_in_the_residual(monkeypatch):
+    """It has no closed form: forward mode takes it as it stands, with data of its own."""
+    options = Options(transition=3.125)  # of no other test: programs are kept by it
+    study = build_study([curve(12.0), curve(33.0)], GEOMETRY, options, noise=Noise(force=0.1))
+    lane = jax.tree.map(lambda v: jnp.asarray(v[0]), study.lanes)
+    theta = jnp.array([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]])
+    run = functools.partial(jax.jit, compiler_options=QUICK)
+    whole = run(lambda t: residual(study.model, t, lane)[:2])(theta)
+    monkeypatch.setattr("jaxtrachea.fitting.model.level_of", lambda o: Half(level_of(o)))
+    half = run(lambda t: residual(study.model, t, lane)[:2])(theta)
+    data = np.asarray(lane.force * lane.precision)
+    np.testing.assert_allclose(half[0] + data, (whole[0] + data) / 2, rtol=1e-12)
+    np.testing.assert_allclose(half[1], whole[1] / 2, rtol=1e-9, atol=1e-12)
+
+
+def test_a_sample_without_a_solution_has_a_status_and_no_number(word):
+    """Off the tube: of every level the same word."""
+    level = level_of(options_of(word))
+    values = {n: jnp.asarray(DEFAULTS[n].value) for n in level.needs(joints=True)}
+    motion = Motion(jnp.asarray(-5.0), jnp.array([0.5]), onset=jnp.asarray(0.0))
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def off(values):
+        found = level.response(GEOMETRY, level.material(values), motion)
+        return found.force, found.status
+
+    force, status = off(values)
+    assert np.isnan(force).all()
+    assert (status == PressStatus.OFF_TUBE).all()
+
+
+def test_nobody_asks_which_level_it_is():
+    """Outside of the mechanics no module of fits or predictions compares the skeleton's word."""
+    for room in ("fitting", "prediction", "inference", "results"):
+        for path in (PACKAGE / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Compare) and isinstance(node.left, ast.Attribute):
+                    assert node.left.attr != "skeleton", f"{path.name}: {ast.unparse(node)}"
