@@ -236,7 +236,7 @@ def test_ecoflex(name, tmp_path, monkeypatch, capsys):
     powers, free, own_zero = [int(n[2:]) for n in law], 0, 0
     for curve in read_data(load_fit_spec(path), ECOFLEX).curves:
         row = rows[curve.specimen, curve.trial]
-        # Given the onset and the offset that a record asks for, the law is linear in its coefficients.
+        # Given the onset and the offset that a record asks for, the law is linear in the rest.
         onset, offset = (float(row.get(n) or 0) for n in ("onset [mm]", "force_offset [N]"))
         own_zero += bool(onset or offset)
         D = np.maximum(curve.displacement - onset, 0)

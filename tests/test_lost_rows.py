@@ -140,7 +140,7 @@ def test_a_displacement_that_is_no_number_says_nothing_of_the_onset(options, los
         np.testing.assert_allclose(found, alone, rtol=1e-12)
 
 
-@pytest.mark.parametrize("lost", [np.nan, np.inf, -1.0])
+@pytest.mark.parametrize("lost", [np.nan, *late(np.inf, -1.0)])
 def test_a_place_off_the_beam_says_nothing_of_the_beam(lost):
     """As if it had not been asked for: `contact_compliance` of one and of many, `deflect`."""
 
