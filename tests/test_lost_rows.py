@@ -81,8 +81,8 @@ LOST = {
     ("loss", "skip"),
     [
         (by_press(Options()), ()),
-        (by_press(Options(coupling="total")), ()),
-        (by_press(Options(skeleton="softening")), ()),
+        pytest.param(by_press(Options(coupling="total")), (), marks=pytest.mark.slow),
+        pytest.param(by_press(Options(skeleton="softening")), (), marks=pytest.mark.slow),
         pytest.param(by_oblique, (), marks=pytest.mark.slow),
         pytest.param(
             by_scene,
@@ -117,6 +117,7 @@ def test_a_row_without_a_solution_leaves_shared_derivatives_as_they_are(loss, sk
                 np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-15, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{}, *late({"coupling": "total"}, {"contact": "bonded"})], ids=str
 )
