@@ -66,6 +66,8 @@ def _check_what_is_annotated() -> None:
 
 _check_what_is_annotated()
 
+pytest_plugins = ["costs"]
+
 
 #: Programs compiled since they were last dropped.
 _compiled = 0

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.mechanics.axial import stretch
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 X, LENGTH = np.array([10.0, 25.0, 40.0, 70.0]), 100.0
 POSITIONS = [0.0, 1e-3, 7.0, 25.0, 55.0, 70.0, 99.0, 100.0]
 SPRINGS = [(None, None), (2.0, None), (None, 0.05), (0.3, 1e4), (0.0, 0.4), (0.4, 0.0)]

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from late import late
 
 from jaxtrachea.mechanics import beam as room
 from jaxtrachea.mechanics import reactions
 from jaxtrachea.mechanics.beam import Beam, contact_compliance, deflect
 
-DTYPES = ["float64", "float32"]
+DTYPES = ["float64", *late("float32")]
 #: A step of the recursion rounds about 30 times by half of eps; measured at most 7 eps, with and
 #: without fused multiplication and addition.
 ROUNDINGS = 16

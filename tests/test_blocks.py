@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.surface import regions
 from jaxtrachea.surface.blocks import LEAST, WIDEST, in_blocks, to_blocks, to_vertices
@@ -64,7 +65,7 @@ def test_few_vertices_stand_alone():
     assert to_blocks(patch, None).shape == (100, 1)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_derivatives_of_the_way_back(dtype):
     """Forward and reverse, single and in lanes, against indexing by numpy."""
     blocks = grouped(drawn(300, 5), 5)

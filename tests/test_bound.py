@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from late import late
 
 import jaxtrachea as jt
 from jaxtrachea import Material, Options, press, table_1
@@ -19,7 +20,7 @@ def material(dtype, **changes):
     return Material(**{k: jnp.asarray(v, dtype) for k, v in (VALUES | changes).items()})
 
 
-@pytest.fixture(scope="module", params=["float32", "float64"])
+@pytest.fixture(scope="module", params=["float64", *late("float32")])
 def bound(request):
     """The program, the tube and `press` of a dtype."""
     dtype = request.param

@@ -6,6 +6,7 @@ import bounded
 import numpy as np
 import pytest
 import synthetic
+from late import late
 
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
@@ -73,7 +74,7 @@ def check_nothing_lower(study, sigma, solved, dtype):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, *late(np.float32)])
 def test_random_bounds_against_scipy(dtype):
     """Most lanes end on a bound."""
     study, sigma, solved = check_lanes(60, dtype)
@@ -83,7 +84,7 @@ def test_random_bounds_against_scipy(dtype):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, *late(np.float32)])
 def test_1000_random_bounds(dtype):
     """From the same starts SciPy and we end in the same minimum, but for 4 % of the lanes."""
     study, sigma, solved = check_lanes(1000, dtype)

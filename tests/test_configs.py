@@ -146,6 +146,7 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
     assert (force[:, 1] < 0.9 * force[:, 3]).all()
 
 
+@pytest.mark.slow
 def test_a_sweep_names_the_statuses_of_its_points(tmp_path, monkeypatch, capsys):
     """Points that are solved, but too deep, counted as without a solution, and nothing said why."""
     monkeypatch.chdir(tmp_path)

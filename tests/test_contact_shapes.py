@@ -10,6 +10,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from late import late
 from scipy.spatial.transform import Rotation
 
 from jaxtrachea.contact.pose import (
@@ -37,7 +38,7 @@ from jaxtrachea.contact.shapes import (
     support,
 )
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 POINTS = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 1], [0.4, 0.4, 0.2], [2, 0, 0]], float)
 SHAPES = {
     "sphere": sphere(1.5),

@@ -157,6 +157,7 @@ def test_sentences(rows, left, says):
     assert says in sentence(rows, left)
 
 
+@pytest.mark.slow
 def test_deflated_difference_is_that_by_hand():
     """AR(1) noise of 0.8: deviances of the normal equations times n_eff / n, unknowns in full."""
     rng = np.random.default_rng(2)
@@ -211,6 +212,7 @@ def test_other_data_or_noise_are_refused():
         same_data(given, "ab")
 
 
+@pytest.mark.slow
 def test_leaving_a_position_out_is_a_fit_without_it():
     """Curves of both trials at a position go together; against least squares of the others."""
     rng = np.random.default_rng(3)

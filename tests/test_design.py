@@ -231,7 +231,7 @@ def test_expected_errors_are_those_of_the_refit(balance):
 
 @pytest.mark.parametrize(
     ("loss", "given"),
-    [("linear", False), pytest.param("huber", False, marks=pytest.mark.slow), ("huber", True)],
+    [("linear", False), *(pytest.param("huber", v, marks=pytest.mark.slow) for v in (False, True))],
 )
 def test_errors_before_any_press_are_those_of_the_fit(loss, given):
     """Also where the noise is estimated, and with a robust loss."""
@@ -335,6 +335,7 @@ def late_study(onset, late=10.0):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("onset", [{}, *late({"fixed": True, "value": 10.0})])
 def test_depths_of_presses_are_from_first_touch(onset):
     """Records from 8 to 13 mm that touch at 10 mm: presses of 3 mm; 13 mm were taken for them."""

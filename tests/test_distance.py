@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from late import late
 
 from jaxtrachea.contact.distance import direction_table, signed_distance, track
 from jaxtrachea.contact.pose import (
@@ -35,7 +36,7 @@ from jaxtrachea.contact.shapes import (
 )
 from jaxtrachea.status import ContactStatus
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 #: Rounding, in units of the size of the pair: of the reference and of the search together.
 ROUNDING = {"float32": 3e-6, "float64": 1e-12}
 #: Most of the time here is compilation.

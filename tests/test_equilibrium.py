@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, duffing, fold_depth
 from jaxtrachea.status import PressStatus
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 series, total = jax.jit(press_series), jax.jit(press_total)
 
 

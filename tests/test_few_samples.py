@@ -203,6 +203,7 @@ def test_infeasible_starts_stay_what_they_are(study):
     assert (result.status[np.arange(LANES) != 2] == FitStatus.CONVERGED).all()
 
 
+@pytest.mark.slow
 def test_an_end_that_all_samples_do_not_have_is_left(study, seen, monkeypatch):
     """Such a start begins anew, on all samples from where it was drawn."""
     solve = minima._solve

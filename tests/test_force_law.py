@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 from scipy.optimize import brentq
 
 from jaxtrachea.mechanics.force_law import (
@@ -15,7 +16,7 @@ from jaxtrachea.mechanics.force_law import (
     ring_weight,
 )
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 RINGS = np.array([10.0, 20.0, 32.0])
 
 

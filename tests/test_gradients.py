@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from late import late
 
 from jaxtrachea.mechanics.axial import stretch
 from jaxtrachea.mechanics.beam import Beam, contact_compliance, deflect
@@ -151,7 +152,7 @@ def test_contact_on_a_ring(ring):
         assert np.all((np.abs(q - p) < peak) | (np.abs(q - r) < peak)), name
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 @pytest.mark.parametrize("k", [1e-9, 0.1, 1e12])
 @pytest.mark.parametrize("cut", [False, True])
 def test_finite_at_nasty_positions(cut, k, dtype):
@@ -199,7 +200,7 @@ def test_press_law(f, k_3):
     check(f, {"D": np.array([0.5, -1.5, 3.0]), "c": 0.9, "k_1": 0.4, "k_3": k_3}, rtol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 @pytest.mark.parametrize("k_3", [0.0, 1e-30, 1e30, -0.01])
 def test_press_law_at_zero(k_3, dtype):
     """D = 0: d depth / dD = 1 / (1 + c k_1) whatever k_3, and no other input matters."""
@@ -276,7 +277,7 @@ def test_press(options):
     check(pressing(options), values, rtol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 @pytest.mark.parametrize("k_3", [0.0, 1e-30, 1e20, -1e-4])
 def test_press_finite_at_zero(k_3, dtype):
     """Before, at and just after first touch, in both dtypes; k_3 from 0 to huge."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.status import PressStatus
@@ -79,7 +80,10 @@ def test_value_and_gradient(name, dtype):
     assert all(np.isfinite(v) for v in gradient.values())
 
 
-@pytest.mark.parametrize("name", [n for n, c in CASES.items() if c[2] == PressStatus.OK])
+OTHERS = [n for n, c in CASES.items() if c[2] == PressStatus.OK and n != "200 rings"]
+
+
+@pytest.mark.parametrize("name", ["200 rings", *late(*OTHERS)])
 def test_float32_agrees_with_float64(name):
     one, two = (solved(name, dtype)[0] for dtype in DTYPES)
     np.testing.assert_allclose(one.force, two.force, rtol=2e-5)
@@ -88,7 +92,7 @@ def test_float32_agrees_with_float64(name):
     np.testing.assert_allclose(one.reactions, two.reactions, atol=3e-5 * peak, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_bad_rows_do_not_touch_their_neighbours(dtype):
     """NaN and folded specimens in a batch are flagged; the good ones keep every bit."""
     rows = [CASES[n][0] for n in ("plain", "NaN ligament", "on a ring", "past the fold")]

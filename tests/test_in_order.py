@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from kernels import count_kernels
+from late import late
 
 import jaxtrachea
 from jaxtrachea import (
@@ -34,13 +35,13 @@ from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.scene.deform import _sag
 
-DTYPES = ["float32", "float64"]
+DTYPES = [*late("float32"), "float64"]
 NOT_INLINED = 'inlineable="false"'
 #: With the first word: XLA makes calls of its own small loops.
 ONE = f'{NOT_INLINED},xla_cpu_small_call="true"'
 BOTH = pytest.mark.parametrize("mark", [in_order, one_kernel])
 ALL = pytest.mark.parametrize("mark", [in_order, one_kernel, lanes_in_one_kernel])
-pytestmark = pytest.mark.usefixtures("on_the_cpu")
+pytestmark = [pytest.mark.usefixtures("on_the_cpu"), pytest.mark.compiling]
 
 
 class Out(NamedTuple):
@@ -153,7 +154,6 @@ def arguments(lanes, dtype):
 
 
 @pytest.mark.slow
-@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("way", list(WAYS))
 @ALL
@@ -180,6 +180,7 @@ SHARED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("lanes", list(SHARED))
 @BOTH
@@ -196,6 +197,7 @@ def test_derivatives_of_a_program_of_lanes(mark, lanes, dtype):
     close(ways(mark(part)), ways(part))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @BOTH
 def test_second_derivatives_of_a_loop(mark, dtype):
@@ -211,6 +213,7 @@ def test_second_derivatives_of_a_loop(mark, dtype):
     close(slopes(mark(part)), slopes(part))
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_loop_takes_no_part_apart(mark):
     """What a part computes of constants alone stays in it.
@@ -238,6 +241,7 @@ def test_the_derivative_by_hand():
     np.testing.assert_allclose(jax.grad(slope)(x), 2 * np.cos(0.7) - 0.7 * np.sin(0.7), rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("first", ["index", "truth"])
 def test_a_first_result_without_a_derivative(first, dtype):
@@ -279,6 +283,7 @@ def part_of_it(x, v):
     return jnp.sin(x), x * v[::-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_one_pose_calls_it_and_many_lanes_hold_it(dtype):
     """In the compiled program; with lanes also where the first result has none of its own."""
@@ -303,6 +308,7 @@ def test_one_pose_calls_it_and_many_lanes_hold_it(dtype):
     assert NOT_INLINED not in program(jax.vmap(gradient), x, y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", ["cacheable", "value", "module"])
 def test_an_older_jax_has_the_part_itself(missing, monkeypatch):
     """Without what JAX 0.6 lacks, and without the module, nothing is marked and nothing fails."""
@@ -354,6 +360,7 @@ def test_one_kernel_is_one(dtype):
     assert ONE not in many
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_many_lanes_in_one_kernel_are_one(dtype):
     """Cube roots again, with their derivative a^(-2/3) / 3 from inside; of one lane not."""
@@ -450,6 +457,7 @@ UNFIT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", list(UNFIT))
 def test_what_one_kernel_cannot_hold_is_compiled_as_before(what):
     """Sorting, libraries, large arrays and those without entries."""
@@ -484,6 +492,7 @@ def test_inputs_that_one_kernel_does_not_read():
         np.testing.assert_array_equal(moved, x + np.array([1.0, 0, 0]))
 
 
+@pytest.mark.slow
 def test_another_compiler_runs_it_in_order(monkeypatch):
     """With a jaxlib that nobody has tried."""
     monkeypatch.setattr(_in_order, "_one_kernel_p", None)
@@ -500,6 +509,7 @@ def test_another_compiler_runs_it_in_order(monkeypatch):
     assert ONE not in compiled(lanes, *at)
 
 
+@pytest.mark.slow
 def test_without_single_kernels():
     """The switch in the environment, read when the package is imported."""
     program = "from jaxtrachea import _in_order as m; assert m._one_kernel_p is None"
@@ -517,6 +527,7 @@ REDUCTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("entries", [4000, 4096])
 @pytest.mark.parametrize("what", list(REDUCTIONS))
@@ -530,6 +541,7 @@ def test_reductions_of_many_entries(what, entries, dtype):
         assert (ONE in compiled(marked, x)) == (entries == 4000)
 
 
+@pytest.mark.slow
 def test_what_is_not_numbers_is_not_in_one_kernel():
     """Keys of random numbers, and complex ones."""
     x, key = numbers("float64")[0], jax.random.key(3)
@@ -539,6 +551,7 @@ def test_what_is_not_numbers_is_not_in_one_kernel():
         assert ONE not in compiled(marked, x, extra)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mark", [in_order, one_kernel])
 def test_programs_for_several_devices_have_no_marks(mark):
     """One text for all of them; for another device alone too."""
@@ -576,11 +589,11 @@ def pressed(name):
     return run
 
 
-SLOW = pytest.mark.slow, pytest.mark.compiling
 LONG = "arch2, shear, bonded", "mat", "arch", "total coupling", "friction"
 
 
-@pytest.mark.parametrize("name", [*PUNCHES, *(pytest.param(v, marks=SLOW) for v in LONG)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*PUNCHES, *LONG])
 def test_presses_and_their_derivatives_fit_one_kernel(name):
     """What scenes put into a kernel: with a product or a scatter it would be hundreds."""
     names = "EI_L k_M k_1 k_3 EA_L EI_C k_t GA_L k_A k_1_ring".split()
@@ -602,6 +615,7 @@ def test_presses_and_their_derivatives_fit_one_kernel(name):
         assert _in_order.fits_one_kernel(jax.make_jaxpr(f)(*arguments).jaxpr), f.__name__
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("n", [2, 33, 501])
 def test_running_sums_are_in_one_kernel(n, dtype):
@@ -626,6 +640,7 @@ def test_a_tool_of_few_corners_is_in_the_kernel_that_lays_out_a_dent():
     assert _in_order.fits_one_kernel(program.jaxpr)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_loss_of_a_press_by_its_public_name(dtype):
     """As docs/layer.md has it: value and derivatives against the closed form, alone and in lanes.

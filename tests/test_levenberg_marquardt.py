@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compilations import compilations
+from late import late
 
 from jaxtrachea.optimisation.curvature import Rest, secant_update
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
@@ -161,7 +162,7 @@ def test_float32_ends_on_the_bound_as_given():
     np.testing.assert_allclose(solved.theta[0, 1], bound**2, rtol=1e-3)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, *late(np.float32)])
 @pytest.mark.parametrize(
     ("residual", "start", "cost", "steps"),
     [(jennrich_sampson, (0.3, 0.4), 124.362, 16), (brown_dennis, (25, 5, -5, -1), 85822.2, 20)],
@@ -181,7 +182,7 @@ def test_minima_with_large_residuals(residual, start, cost, steps, dtype: Any):
     assert solved.iterations[0] <= steps, solved.iterations
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, *late(np.float32)])
 def test_a_secant_update_knows_the_step_just_taken(dtype):
     """Afterwards the rest times the step is what the residual's second derivatives make of it."""
     far = jnp.full(4, 100, dtype)

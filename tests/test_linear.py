@@ -133,7 +133,9 @@ RULES = {"shares": shares, "combined": combined, "spread": spread}
 
 
 @pytest.mark.parametrize("dtype", [pytest.param("float32", marks=SLOW), "float64"])
-@pytest.mark.parametrize("rule", ["shares", "spread", pytest.param("combined", marks=SLOW)])
+@pytest.mark.parametrize(
+    "rule", ["shares", *(pytest.param(v, marks=SLOW) for v in ("spread", "combined"))]
+)
 def test_rules_of_the_surface(rule, dtype):
     """By all arguments, by each and by each two, both ways."""
     f, at = RULES[rule](dtype)
@@ -156,9 +158,9 @@ def test_rules_of_the_surface(rule, dtype):
             close(got, expected, factor=1024)
 
 
-@pytest.mark.parametrize(
-    "rule", ["shares", *(pytest.param(v, marks=SLOW) for v in ("combined", "spread"))]
-)
+@pytest.mark.slow
+@pytest.mark.compiling
+@pytest.mark.parametrize("rule", list(RULES))
 def test_rules_of_the_surface_against_differences(rule):
     """Central differences of values and of gradients, along random directions."""
     f, at = spread("float64", on_a_centre=False) if rule == "spread" else RULES[rule]("float64")

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea._in_order import fits_one_kernel, one_kernel
 from jaxtrachea._numerics import largest
@@ -25,7 +26,7 @@ from jaxtrachea.scene import trail
 from jaxtrachea.scene.stage import Poses
 from jaxtrachea.status import FitStatus, PressStatus
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 
 
 @jax.jit

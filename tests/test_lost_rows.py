@@ -81,8 +81,8 @@ LOST = {
     ("loss", "skip"),
     [
         (by_press(Options()), ()),
-        (by_press(Options(coupling="total")), ()),
-        (by_press(Options(skeleton="softening")), ()),
+        pytest.param(by_press(Options(coupling="total")), (), marks=pytest.mark.slow),
+        pytest.param(by_press(Options(skeleton="softening")), (), marks=pytest.mark.slow),
         pytest.param(by_oblique, (), marks=pytest.mark.slow),
         pytest.param(
             by_scene,
@@ -117,6 +117,7 @@ def test_a_row_without_a_solution_leaves_shared_derivatives_as_they_are(loss, sk
                 np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-15, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{}, *late({"coupling": "total"}, {"contact": "bonded"})], ids=str
 )
@@ -140,7 +141,7 @@ def test_a_displacement_that_is_no_number_says_nothing_of_the_onset(options, los
         np.testing.assert_allclose(found, alone, rtol=1e-12)
 
 
-@pytest.mark.parametrize("lost", [np.nan, np.inf, -1.0])
+@pytest.mark.parametrize("lost", [np.nan, *late(np.inf, -1.0)])
 def test_a_place_off_the_beam_says_nothing_of_the_beam(lost):
     """As if it had not been asked for: `contact_compliance` of one and of many, `deflect`."""
 

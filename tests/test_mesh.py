@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from late import late
 
 from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry, table_1
@@ -48,7 +49,7 @@ def as_arrays(mesh):
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_default_tube_is_the_papers_size(dtype):
     mesh = make_tube(table_1(dtype))
     assert mesh.faces.shape == (6856, 3)

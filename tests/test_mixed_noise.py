@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import synthetic
+from late import late
 from run_cli import run
 
 from jaxtrachea.fitting.fit import fit
@@ -53,7 +54,7 @@ def slopes(values):
     return (np.array(v) for v in zip(*rows, strict=True))
 
 
-@pytest.mark.parametrize("given", [0.05, MARKER])
+@pytest.mark.parametrize("given", [0.05, *late(MARKER)])
 def test_errors_are_of_each_kinds_own_noise(given):
     """(J_f^T J_f / s^2 + J_m^T J_m / sigma^2)^-1, s from forces alone.
 
@@ -107,6 +108,7 @@ def test_markers_beyond_their_noise_are_told():
         assert found.ratio[0, 1] == pytest.approx(MARKER / given, rel=0.1)
 
 
+@pytest.mark.slow
 def test_some_curves_with_a_sigma_and_others_without_are_refused():
     """1 / N and a pure number were summed: bands of 1.9 N where 0.04 are right."""
     curves = marked("A", markers=False) + marked("B", markers=False)
@@ -134,6 +136,7 @@ def test_a_file_without_sigma_beside_one_with_is_named(tmp_path, monkeypatch, ca
     assert run(monkeypatch, capsys, "check", "fit.toml")[0] == 0
 
 
+@pytest.mark.slow
 def test_the_share_of_markers_counts_from_first_touch():
     """A record whose zero lies 10 mm before the touch: errors were 5.7 to 6.7 times as large."""
     noise = Noise(force=FORCE, joints=MARKER, joints_share=0.1)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.mechanics import beam, equilibrium, force_law
 from jaxtrachea.mechanics.press import Options, ligament_beam, local_law, press, touch
@@ -13,7 +14,7 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.material import Material
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02}
 MORE = {"GA_L": 1.1, "k_1_ring": 0.9, "k_3_ring": 0.05}
 D = np.array([-0.5, 0.0, 0.2, 1.0, 3.0])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea._in_order import fits_one_kernel
 from jaxtrachea._numerics import (
@@ -25,7 +26,7 @@ from jaxtrachea._numerics import (
     turned,
 )
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import (
@@ -26,7 +27,7 @@ from jaxtrachea.trachea.material import Material
 
 pytestmark = pytest.mark.compiling
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 ALPHA = 2 * math.pi / 3
 VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02, "EA_L": 3.9, "EI_C": 13.0, "k_t": 0.4}
 MORE = {"k_A": 0.5, "k_B": 2.0, "EI_side": 5.0}
@@ -356,7 +357,7 @@ value_of = jax.jit(_values, compiler_options=QUICK)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("D", [[0.3, -1.0, 0.5], [0.0, 0.0, 0.0]])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_gradients(D, dtype):
     """Forward = reverse = central differences through the whole, also without displacement."""
     point = VALUES | MORE | {"s": 63.0, "phi": 0.4, "D": np.array(D)}

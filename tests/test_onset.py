@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
+from late import late
 from scipy.integrate import quad
 from scipy.optimize import least_squares
 
@@ -58,7 +59,7 @@ def test_rounded_corner_is_the_average_of_the_sharp_one():
     np.testing.assert_allclose(np.trapezoid(got, x), 0.5 + 0.005**2 / 12, atol=1e-9)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_rounded_corner_differentiates(dtype):
     x, width = jnp.asarray([-0.31, -0.3, -0.2, 0.0, 0.1, 0.3, 0.5], dtype), jnp.asarray(0.3, dtype)
     one = jax.jit(jax.vmap(jax.value_and_grad(centred_hinge), (0, None)))
@@ -267,6 +268,8 @@ def test_a_stiffness_of_one_curve_is_still_refused():
         curves_to_leave_out(study)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_influence_of_a_curve_with_its_own_onset(owned):
     """First order against the refit without the curve; what goes with the curve is a dash."""
     found = influence(owned).of

@@ -212,6 +212,7 @@ def same_row(found, expected, rtol):
 SHOWN = SCENE | {"output": {"surface": True}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("record", "dtype"), [
     (SCENE, "float64"), pytest.param(SCENE, "float32", marks=pytest.mark.slow),
     pytest.param(SHOWN, "float64", marks=pytest.mark.slow),

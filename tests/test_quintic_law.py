@@ -6,6 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import scipy.optimize
+from late import late
 
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
@@ -22,7 +23,7 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 C_FULL = np.array([[1.5, 0.3, -0.2], [0.3, 0.8, 0.1], [-0.2, 0.1, 2.2]])
 #: k_1, k_3, k_5: hardening, as silicone (dips, then hardens), linear, all but k_5, softening.
 LAWS = [(0.3, 0.02, 0.004), (0.5, -0.08, 0.012), (0.4, 0.0, 1e-12), (1e-3, 1e-6, 5.0),

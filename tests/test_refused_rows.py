@@ -114,6 +114,7 @@ def test_zero_limits():
     np.testing.assert_allclose(out.compliance[1:], [160.0**3 / (192 * 1.862), 0, 0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_friction_that_is_no_number():
     """Without limit the tool sticks; negative is a bad material, as a stiffness is."""
     D = np.linspace(0, 1, 3)[:, None] * np.array([0.1, -1.0, 0.0])

@@ -157,6 +157,8 @@ def test_names_are_plain_text_in_pictures(name):
     assert axis.title._preprocess_math(axis.title.get_text())[0].strip().startswith(head)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_run_of_such_names_writes_all_its_files(many, tmp_path):
     """Every picture and the page; markup and formulas as text; tables say what they leave out."""
     paths, lost = draw_all(tmp_path, Findings(many))
@@ -418,6 +420,8 @@ def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
     assert all(float(row["low95"]) <= float(row["low95_independent"]) for row in parameters)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense):
     """The report had them in the order of the file, the terminal the worst first."""
     lane, trial = np.zeros(14, int), np.arange(14) % 4

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 from scipy.linalg import solve_banded
 
 from jaxtrachea.mechanics.ring import (
@@ -22,7 +23,7 @@ from jaxtrachea.status import RingStatus
 ALPHA = 2 * math.pi / 3
 TABLE_1 = {"radius": 11.3, "half_angle": ALPHA, "EI": 13.0, "k_M": 0.1, "k_t": 0.4}
 ANGLES = (0.0, 0.4, 1.9)
-DTYPES = ["float64", "float32"]
+DTYPES = ["float64", *late("float32")]
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
 
 compliance = jax.jit(ring_compliance, static_argnames="order", compiler_options=QUICK)

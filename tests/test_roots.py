@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.mechanics.roots import (
     Rising,
@@ -19,7 +20,7 @@ from jaxtrachea.mechanics.roots import (
     rising_root,
 )
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 ratio = jax.jit(cubic_ratio)
 
 

@@ -77,12 +77,12 @@ def compilations():
     under_way.clear()
 
 
-#: Those that take longest to compile, of kinds that others are of too.
-LONG = ("press_path", "skeleton_response", "simulate", "sweep")
+#: The default suite has one that is solved and one that is not; the others take long to compile.
+DEFAULT = ("press", "deflect")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in CALLS]
+    "name", [n if n in DEFAULT else pytest.param(n, marks=pytest.mark.slow) for n in CALLS]
 )
 def test_a_call_without_jit_is_one_program(name):
     """A first call of `press_oblique` compiled 361 programs, every other one 3."""
@@ -97,6 +97,7 @@ def test_a_call_without_jit_is_one_program(name):
     assert all(np.isfinite(v).all() for v in numbers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.vmap])
 def test_derivatives_and_batches_of_a_press_are_compiled_once(derivative):
     """But for the way back over the rings, whose `scan` JAX makes anew each time."""

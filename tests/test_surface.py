@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.mechanics.beam import Beam, deflect
 from jaxtrachea.surface import local, phong, regions
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.compiling
 
 ALPHA = 2 * math.pi / 3
 METHODS = ["linear", "hermite", "phong"]
-DTYPES = ["float64", "float32"]
+DTYPES = ["float64", *late("float32")]
 GEOMETRY = table_1()
 TUBE = make_tube(GEOMETRY)
 bind = jax.jit(regions.bind)
@@ -601,7 +602,7 @@ def test_global_and_local_make_up_the_tool_displacement():
     np.testing.assert_allclose(at_C + correction(found, here)[0], keys.contact + d, atol=1e-9)
 
 
-@pytest.mark.parametrize("given", ["float32", "float64"])
+@pytest.mark.parametrize("given", ["float64", *late("float32")])
 def test_targets_of_another_dtype(given):
     """Promoted to that of the centres, as the numpy solution of the same equations is."""
     rng = np.random.default_rng(2)

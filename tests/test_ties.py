@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.patches import straight_patches, touch
@@ -164,7 +165,7 @@ def same(one, two, size, dtype, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_ties_are_right_and_told(dtype, scale):
     """The gap of the closed form, a normal of the exact set, FLAT."""
     got, size = results("ties", dtype, scale), sizes(TIES, scale)
@@ -182,7 +183,7 @@ def test_ties_are_right_and_told(dtype, scale):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_off_a_tie_the_normal_is_the_only_one(dtype, scale):
     """A hundredth of the size off: OK, and the one normal; flat faces have one normal too."""
     got, size = results("single", dtype, scale), sizes(SINGLE)
@@ -197,7 +198,7 @@ def test_off_a_tie_the_normal_is_the_only_one(dtype, scale):
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("name", ["ties", "single"])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_every_unit_gives_the_same(name, dtype):
     cases = {"ties": TIES, "single": SINGLE}[name]
     # Points without a size are smoothed as if it were 1 mm: their lengths depend on the unit.
@@ -217,7 +218,7 @@ def test_both_dtypes_give_the_same(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ties", "single"])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_alone_as_in_a_batch(name, dtype):
     """Programs of one lane and of many round differently; at an odd scale that vertices feel."""
     cases, scale = {"ties": TIES, "single": SINGLE}[name], 0.01

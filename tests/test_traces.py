@@ -274,6 +274,7 @@ print(len(jax.devices()), len(counted), len(list(pathlib.Path(sys.argv[1]).iterd
 """
 
 
+@pytest.mark.slow
 def test_threads_on_two_devices(tmp_path):
     """As shards of a study: one trace, compiled once for each device."""
     environment = os.environ | {

@@ -8,13 +8,14 @@ import mpmath as mp
 import numpy as np
 import pytest
 import scipy.optimize
+from late import late
 
 from jaxtrachea.mechanics.equilibrium import press_series
 from jaxtrachea.mechanics.force_law import Law, duffing
 from jaxtrachea.mechanics.vector_equilibrium import press_vector, press_vector_total
 from jaxtrachea.status import PressStatus
 
-DTYPES = ["float32", "float64"]
+DTYPES = ["float64", *late("float32")]
 solve = jax.jit(press_vector)
 lanes = jax.jit(jax.vmap(lambda D, C, a, b: press_vector(D, C, Law(a, b))))
 C_FULL = np.array([[3.0, 0.5, 0.2], [0.5, 1.0, 0.1], [0.2, 0.1, 0.3]])

@@ -9,13 +9,14 @@ import pytest
 from jax import lax
 from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
 from kernels import count_kernels
+from late import late
 
 from jaxtrachea import _in_order
 from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea._written_out import written_out
 
-DTYPES = ["float32", "float64"]
+DTYPES = [*late("float32"), "float64"]
 #: Products as `einsum` names them, and the sizes of the two.
 PRODUCTS = {
     "i,i->": ((5,), (5,)),
@@ -83,6 +84,8 @@ def compiled(f, *inputs):
     return jax.jit(f).lower(*inputs).compile().as_text()
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.usefixtures("on_the_cpu")
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_single_call_is_one_kernel_and_lanes_are_the_librarys(dtype):

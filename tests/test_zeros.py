@@ -194,6 +194,7 @@ def test_fit_of_a_mixed_study(fitted):
     np.testing.assert_allclose(fitted.rms[0, 0], SIGMA, rtol=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 def test_predictions_of_a_mixed_fit(fitted):
     """The fit's own trials, a new press, and new records: each with the zeros of its own record."""

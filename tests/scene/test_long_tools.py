@@ -33,13 +33,14 @@ def scene_of(tool, radius, gaps=GAPS, x=75.0):
     return scene, path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tool", "radius"),
     [
         (capsule(10.0, 4.0), 4.0),
-        pytest.param(capsule(150.0, 4.0), 4.0, marks=pytest.mark.slow),
-        pytest.param(capsule(490.0, 4.0), 4.0, marks=pytest.mark.slow),
-        pytest.param(sphere(200.0), 200.0, marks=pytest.mark.slow),
+        (capsule(150.0, 4.0), 4.0),
+        (capsule(490.0, 4.0), 4.0),
+        (sphere(200.0), 200.0),
     ],
 )
 def test_gaps_do_not_grow_with_the_tool(tool, radius):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from late import late
 from small_scenes import BALL, ball
 
 from jaxtrachea import EffectOptions, Geometry, PlanError, Presses, make_scene, simulate
@@ -54,7 +55,7 @@ def vertex(s, phi):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_vertices_go_with_tool_and_rings(dtype):
     """The one under the tool by the tool's way, those at ring ends as these do; rest stays."""
     D = np.array(PATH.displacement)

@@ -105,6 +105,7 @@ def test_it_lets_go_and_touches_elsewhere():
         np.testing.assert_allclose(last.s, s, atol=0.2)
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_or_allocated_by_a_step():
     scene = make_scene(TUBE, MATERIAL, ball([75, 1, 0], [75, -2, 0]), tool=BALL, mesh=MESH)
     session = Session(scene, MATERIAL, keep=3)

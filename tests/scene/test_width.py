@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import punch_fem
 import pytest
+from late import late
 from run_cli import run as run_cli
 from small_scenes import BALL, BARE, MATERIAL, MESH, OUTER, SPRINGS, TUBE, ball, presses
 
@@ -320,7 +321,7 @@ def test_steps_of_a_session_are_the_rows_of_simulate():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 def test_derivatives_lanes_and_both_precisions(dtype):
     """Forward = reverse = differences by material, place and depth, surface included; `vmap`."""
     effects = EffectOptions(half_width=HALF, contact="bonded")

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from late import late
 
 from jaxtrachea.mechanics.sections.contact import Modal, end_shares, own_deflection
 from jaxtrachea.mechanics.sections.material import from_wall
@@ -33,7 +34,7 @@ RINGS = 10.0 * np.arange(1, 16)
 TUBE = Geometry.create(160.0, RINGS, radius=11.7)
 MATERIAL = from_wall(TUBE)
 R, ALPHA, OUTER = 11.7, float(TUBE.half_angle), 11.7 + float(MATERIAL.offset)
-EITHER = pytest.mark.parametrize("dtype", ["float64", "float32"])
+EITHER = pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 
 
 def element(h, a, c):

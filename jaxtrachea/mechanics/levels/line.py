@@ -19,8 +19,8 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS, VALUES, Material, material_of
 
 #: Depth to which a skeleton was compared with finite elements, in radii of the tube
-#: (docs/evidence/virtual_trachea.md). At a tenth that specimen yields 13 % more than a linear skeleton; the
-#: others were pressed to half.
+#: (docs/evidence/virtual_trachea.md). At a tenth that specimen yields 13 % more than a linear
+#: skeleton; the others were pressed to half.
 TESTED = {"linear": 0.1, "softening": 0.5}
 #: Parameters of the beam; all others of a line act at the contact.
 OF_BEAM = tuple(
