@@ -223,6 +223,7 @@ def _print_usage(out: Console, curves, weighed: bool) -> None:
 
 def _curve_table(curves):
     """Curves, one a row; angle and vectors only where some curve has them."""
+    from jaxtrachea.files.table import words
     from jaxtrachea.measurements.vectors import vector_words
 
     rows = []
@@ -239,11 +240,12 @@ def _curve_table(curves):
         rows.append(row)
     head = ["specimen", "trial", "s [mm]", *(["phi [deg]"] if turned else [])]
     head += ["n", "of", "D [mm]", "F [N]", "markers", *(["vectors"] if several else [])]
-    return table(f"{len(curves)} usable curves", head, rows, ("vectors",))
+    return table(words(f"{len(curves)} usable curves", head, rows, ("vectors",)))
 
 
 def _parameter_table(study):
     """Free parameters; of those that are `auto`, how many curves have one."""
+    from jaxtrachea.files.table import words
     from jaxtrachea.fitting.onset import where_sought
 
     head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
@@ -255,4 +257,4 @@ def _parameter_table(study):
          f"{p.scope}, {own[:, :, j].sum()} of {curves}" if p.auto else p.scope]
         for j, p in enumerate(study.parameters) if not p.fixed
     ]  # fmt: skip
-    return table("Free parameters", head, rows)
+    return table(words("Free parameters", head, rows))
