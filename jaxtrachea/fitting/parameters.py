@@ -8,12 +8,13 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
+from jaxtrachea.mechanics.levels.choose import DECLARED as OF_LEVELS
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.line import OF_BEAM
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES, TOOL_RADIUS, Wall, from_wall
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import OF_PRESS, VALUES, Declaration, Fitted, Scale, Scope
+from jaxtrachea.trachea.material import OF_PRESS, Declaration, Fitted, Scale, Scope
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,8 +123,8 @@ def _of(declared: Declaration, fit: Fitted) -> Parameter:
     )  # fmt: skip
 
 
-#: Every parameter there is, as `trachea.material` and `mechanics.sections.material` declare it.
-DECLARED: Mapping[str, Declaration] = VALUES | SECTION_VALUES | OF_PRESS
+#: Every parameter there is, as the levels of the mechanics and `trachea.material` declare it.
+DECLARED: Mapping[str, Declaration] = {**OF_LEVELS, **OF_PRESS}
 #: Every parameter that can be identified, with its defaults.
 DEFAULTS = {name: _of(p, p.fit) for name, p in DECLARED.items() if p.fit is not None}
 #: Parameters of the beam; of a line of joints all others act at the contact.

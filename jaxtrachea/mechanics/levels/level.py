@@ -15,6 +15,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Declaration
 
 
 class Motion(NamedTuple):
@@ -144,7 +145,7 @@ class Level(abc.ABC):
     """
 
     observes: ClassVar[frozenset[str]]
-    declares: ClassVar[Mapping[str, Any]]
+    declares: ClassVar[dict[str, Declaration]]
     material_type: ClassVar[type]
     iterates: ClassVar[bool] = False
     roundings: ClassVar[float] = 10.0
