@@ -245,7 +245,7 @@ def test_commands_and_options_exist():
 
 
 #: Pages that name what other programs know.
-NOT_OURS = {"benchmarks.md"}
+NOT_OURS = {"benchmarks.md", "developing.md"}
 
 
 def test_commands_without_placeholder_are_run_by_a_test():
