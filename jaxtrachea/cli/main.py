@@ -223,24 +223,32 @@ def _print_usage(out: Console, curves, weighed: bool) -> None:
 
 def _curve_table(curves):
     """Curves, one a row; angle and vectors only where some curve has them."""
-    from jaxtrachea.files.table import words
+    from jaxtrachea.files.table import Column, Table
     from jaxtrachea.measurements.vectors import vector_words
 
-    rows = []
     turned, several = any(c.phi_c for c in curves), any(map(vector_words, curves))
-    for curve in curves[:MANY]:
-        where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
-        markers = 0 if curve.joint_displacement is None else curve.joint_displacement.shape[1]
-        spans = [f"{v.min():.3g} … {v.max():.3g}" for v in (curve.displacement, curve.force)]
-        recorded = len(curve.force) if curve.usage is None else curve.usage.recorded
-        row = [curve.specimen, curve.trial, where]
-        row += [f"{math.degrees(curve.phi_c):.4g}"] if turned else []
-        row += [str(len(curve.force)), str(recorded), *spans, str(markers)]
-        row += [vector_words(curve)] if several else []
-        rows.append(row)
-    head = ["specimen", "trial", "s [mm]", *(["phi [deg]"] if turned else [])]
-    head += ["n", "of", "D [mm]", "F [N]", "markers", *(["vectors"] if several else [])]
-    return table(words(f"{len(curves)} usable curves", head, rows, ("vectors",)))
+    rows = [
+        {
+            "specimen": c.specimen,
+            "trial": c.trial,
+            "s [mm]": c.s_c,
+            "phi [deg]": math.degrees(c.phi_c),
+            "n": len(c.force),
+            "of": len(c.force) if c.usage is None else c.usage.recorded,
+            "D [mm]": (float(c.displacement.min()), float(c.displacement.max())),
+            "F [N]": (float(c.force.min()), float(c.force.max())),
+            "markers": 0 if c.joint_displacement is None else c.joint_displacement.shape[1],
+            "vectors": vector_words(c),
+        }
+        for c in curves[:MANY]
+    ]
+    spans = [Column(name, digits=3) for name in ("D [mm]", "F [N]")]
+    columns = [
+        *map(Column, ("specimen", "trial", "s [mm]", *(["phi [deg]"] if turned else []))),
+        Column("n"), Column("of"), *spans, Column("markers"),
+        *([Column("vectors", left=True)] if several else []),
+    ]  # fmt: skip
+    return table(Table(rows, columns, title=f"{len(curves)} usable curves"))
 
 
 def _parameter_table(study):
