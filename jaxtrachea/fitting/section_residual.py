@@ -90,7 +90,10 @@ def answer(
     phi_c = jnp.zeros_like(tool.s_c) if tool.phi_c is None else tool.phi_c
     along = jnp.asarray([1.0, 0.0], free.dtype) if tool.direction is None else tool.direction
     moved = tool.displacement - values["onset"]
-    pressed = press_sections(tube, material, tool.s_c, phi_c, moved, along, midline=plain)
+    pressed = press_sections(
+        tube, material, tool.s_c, phi_c, moved, along, midline=plain,
+        half_width=model.options.half_width,
+    )  # fmt: skip
     frame = local_frame(phi_c)[::2]  # inward normal, circumference
     force, joints = pressed.force @ frame.T, pressed.joints @ frame.T
     across = jnp.stack([-along[1], along[0]])

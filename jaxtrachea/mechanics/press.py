@@ -51,7 +51,7 @@ class Options:
         skeleton: `linear`, or `softening` for deep presses: it yields more the further it moves
             (needs `Material.e_1` and `e_2`, and `series`); or `sections`, in fits: deforming
             cross-sections, anywhere on the rings and at finite strain (`bonded`; no other option
-            applies). `press_sections` presses that one.
+            but `half_width` applies). `press_sections` presses that one.
     """
 
     coupling: Literal["series", "total"] = "series"
@@ -105,8 +105,7 @@ TESTED = {"linear": 0.1, "softening": 0.5, "sections": 0.5}
 #: Options that a skeleton of deforming cross-sections has: no others apply to it.
 _OF_SECTIONS = {
     "coupling": "series", "split": "continuous", "form": "recursion", "shear": False,
-    "local": "uniform", "transition": None, "half_width": 0.0, "contact": "bonded",
-    "onset_width": 1e-3,
+    "local": "uniform", "transition": None, "contact": "bonded", "onset_width": 1e-3,
 }  # fmt: skip
 
 
