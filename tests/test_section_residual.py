@@ -413,7 +413,6 @@ def test_a_fit_begins_at_the_wall():
         ({"shear": True}, "shear=False, found True"),
         ({"local": "two-material"}, "local='uniform'"),
         ({"coupling": "total"}, "coupling='series'"),
-        ({"half_width": 2.0}, "half_width=0.0, found 2.0"),
         ({"split": "independent"}, "split='continuous'"),
         ({"form": "reactions"}, "form='recursion'"),
         ({"transition": 2.0}, "transition=None"),

@@ -7,9 +7,11 @@ import pytest
 
 from jaxtrachea.config import FitSpec
 from jaxtrachea.fitting.parameters import defaults_of, in_model
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report.understood import model_words, onset_words, tube_line
+from jaxtrachea.mechanics.sections.material import Wall
+from jaxtrachea.report.understood import foreign_factors, model_words, onset_words, tube_line
 from jaxtrachea.trachea.section import geometry_of
 
 D = np.linspace(0, 1, 10)
@@ -86,3 +88,45 @@ def test_model_and_onset():
     assert "fixed at 0 mm" in onset_words(held)
     free = [dataclasses.replace(p, fixed=p.name != "onset", auto=False) for p in table]
     assert onset_words(free).startswith("fitted, one a trial; force offset: ")
+
+
+#: The specimen of the factors, as a specification says it.
+SPECIMEN = {"radius": "11.7 mm", "ring_height": "4 mm"}
+
+
+def factors_line(trachea, wall=None, half_width=0.0, **fixed):
+    """What is said of a fit with deforming cross-sections, and its warning's first words."""
+    tables = {"trachea": SPECIMEN | trachea, "model": {"skeleton": "sections", "contact": "bonded"}}
+    moduli = None if wall is None else {name: f"{v} MPa" for name, v in wall.items()}
+    spec = FitSpec.model_validate({"data": {"files": "x.csv"}, "wall": moduli} | tables)
+    geometry = geometry_of(spec.trachea)
+    options = Options(skeleton="sections", contact="bonded", half_width=half_width)
+    begun = defaults_of(options, geometry, None if wall is None else Wall(**wall))
+    table = [dataclasses.replace(p, **fixed.get(p.name, {})) for p in begun.values()
+             if p.name in in_model(options, joints=False)]  # fmt: skip
+    return foreign_factors(spec, build_study([curve(75.0)], geometry, options, table))
+
+
+def test_values_that_the_factors_of_another_tube_give_are_said():
+    assert factors_line({}) == []
+    (said,) = factors_line({"half_angle": "100 deg"})
+    assert said.startswith("Warning: Et_M, Gt_L, k_end, footprint, c_t, c_t_ring stay fixed")
+    assert "virtual specimen (no [wall])" in said
+    assert "(half-angle of a ring in rad is 1.75, there 2.09)" in said
+    (said,) = factors_line({}, {"E_C": 9.0})
+    assert (
+        "[wall] and the factors of another specimen give (E_C over E_L is 13.8, there 8.92)" in said
+    )
+    free, own = {"fixed": False}, {"value": 3.1}
+    changed = {"Et_M": free, "Gt_L": own, "k_end": own, "c_t": own, "c_t_ring": own}
+    (said,) = factors_line({}, {"E_C": 9.0}, **changed)
+    assert said.startswith("Warning: footprint stay")
+    assert factors_line({}, {"E_C": 9.0}, footprint=own, **changed) == []
+    (said,) = factors_line({}, half_width=2.4)
+    assert "(they were found with a tool that touches at a point)" in said
+
+
+def test_a_line_of_joints_has_no_factors():
+    spec = FitSpec.model_validate({"data": {"files": "x.csv"}})
+    study = build_study([curve(75.0)], geometry_of(spec.trachea), Options())
+    assert foreign_factors(spec, study) == []

@@ -179,7 +179,10 @@ def defaults_of(
                 cure="leave it out, or choose skeleton = 'sections'",
             )  # fmt: skip
         return DEFAULTS
-    material = from_wall(geometry, wall or Wall(), tool_radius=tool_radius or TOOL_RADIUS)
+    material = from_wall(
+        geometry, wall or Wall(), tool_radius=tool_radius or TOOL_RADIUS,
+        half_width=options.half_width,
+    )  # fmt: skip
     values = {name: getattr(material, name) for name in SECTION_VALUES}
     begun = {n: _begun(DEFAULTS[n], float(np.median(np.asarray(v)))) for n, v in values.items()}
     return DEFAULTS | begun

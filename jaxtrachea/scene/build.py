@@ -11,6 +11,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
 from jaxtrachea.mechanics.sections.material import (
+    FROM_FACTORS,
     SECTION_VALUES,
     Factors,
     SectionMaterial,
@@ -130,11 +131,13 @@ def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
     moduli = spec.wall.model_dump()
     tool_radius = moduli.pop("tool_radius")
     try:
-        wall = from_wall(geometry, Wall(**moduli), tool_radius=tool_radius)
+        half = 0.0 if spec.effects.width == "point" else spec.model.half_width
+        wall = from_wall(geometry, Wall(**moduli), tool_radius=tool_radius, half_width=half)
     except InputError as error:
         raise SpecError.like(error, key=f"wall.{error.key}") from None
-    if all(name in named for name, p in SECTION_VALUES.items() if p.fit and not p.fit.fixed):
-        named["extrapolated"] = 0.0  # what a fit estimates, it estimated
+    fitted = [name for name, p in SECTION_VALUES.items() if p.fit and not p.fit.fixed]
+    if all(name in named for name in (*fitted, *FROM_FACTORS)):
+        named["extrapolated"] = 0.0  # nothing is left of the factors
     return dataclasses.replace(wall, **named)
 
 

@@ -148,7 +148,7 @@ def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) ->
         places = None if points is None else jnp.append(points, s)
         found = press_sections(
             scene.geometry, material, s, jnp.zeros_like(phi) if flat else phi, size[None],
-            direction, midline=flat, places=places,
+            direction, midline=flat, places=places, half_width=scene.plan.options.half_width,
         )  # fmt: skip
         return jax.tree.map(lambda v: v[0], found)
 

@@ -164,7 +164,10 @@ def _sections(scene: Scene, material: SectionMaterial, s_c, phi_c, depth) -> _Pr
     inward = local_frame(phi_c)[0]
     on = on_ring(scene.geometry.half_angle, phi_c)[0]
     at = jnp.zeros_like(phi_c) if flat else phi_c
-    found = press_sections(scene.geometry, material, s_c, at, depth[None], midline=flat)
+    found = press_sections(
+        scene.geometry, material, s_c, at, depth[None], midline=flat,
+        half_width=scene.plan.options.half_width,
+    )  # fmt: skip
     status = jnp.where(on, found.status[0], PressStatus.BEHIND_GAP)
     normal = local_frame(at)[0]
     force, way, skeleton = (

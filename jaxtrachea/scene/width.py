@@ -1,6 +1,7 @@
 """Whether the tool has a width along the tube: the rule of `effects`' width.
 
-The punch of `mechanics.punch` is held level in one plane. What of a tool lies on the wall grows
+The punch of `mechanics.punch` is held level in one plane, that of deforming cross-sections wherever
+it presses. What of a tool lies on the wall grows
 with the depth; a width is that of a flat end, and stiffnesses fitted with one belong to it.
 """
 
@@ -36,10 +37,7 @@ def width(case: Case) -> Verdict:
 
 def _undefined(case: Case, half: float) -> tuple[str, str]:
     """Why no punch is defined in this scene, and the cure; empty where one is."""
-    if SECTIONS in case.facts.known:
-        why = "deforming cross-sections have their own footprint of the tool"
-        return why, "leave half_width out"
-    if case.levels["second_plane"] != "off":
+    if SECTIONS not in case.facts.known and case.levels["second_plane"] != "off":
         why = "a width is for presses straight in on the midline, this scene has a second plane"
         return why, _STRAIGHT_IN
     if math.isfinite(case.facts.spacing) and half < NARROW * case.facts.spacing:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+from types import SimpleNamespace
 
 import beam_fem
 import numpy as np
@@ -17,6 +18,7 @@ import jaxtrachea
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.fitting.tested import deeper_than_tested, depths
@@ -32,7 +34,7 @@ from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.rows import lane_rows
 from jaxtrachea.status import FitStatus, PredictionStatus, PressStatus
-from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.geometry import Geometry, table_1
 
 
 @pytest.mark.slow
@@ -192,6 +194,25 @@ def test_an_angle_that_was_not_pressed_is_extrapolated():
     assert words(-0.01, 0.0) == "extrapolated from data at phi = 0 to 30 deg"
     assert words(0.1, 0.1) == "extrapolated from data at tilt = 0 to 0 deg"
     assert words(1.0, -0.1).endswith("phi = 0 to 30 deg and tilt = 0 to 0 deg")
+
+
+@pytest.mark.parametrize(("half_angle", "most"), [(120.0, 90.0), (105.0, 75.0)])
+def test_an_angle_that_sections_were_not_tested_at_is_refused(half_angle, most):
+    """Beyond 90 degrees from the midline, or within 30 of the ends of the rings."""
+    from jaxtrachea.prediction.predict import check_aside
+
+    geometry = Geometry.create(160.0, [40.0, 80.0], half_angle=np.radians(half_angle))
+    options = Options(skeleton="sections", contact="bonded")
+    model = SimpleNamespace(options=options, geometry=geometry)
+    fit = object.__new__(FitResult)
+    object.__setattr__(fit, "study", SimpleNamespace(model=model))
+    for phi in (0.0, most, -most):
+        check_aside(fit, np.radians(phi), (1.0, 0.0))
+    for phi in (most + 0.1, -most - 0.1, half_angle):
+        with pytest.raises(ValueError, match=f"too near to the ends .*{most:g} deg"):
+            check_aside(fit, np.radians(phi), (1.0, 0.0))
+    with pytest.raises(ValueError, match=f"not on the cartilage; .*{half_angle:g} deg"):
+        check_aside(fit, np.radians(half_angle + 1), (1.0, 0.0))
 
 
 def test_rows_where_the_wall_moves_further_than_the_radius_are_told():

@@ -25,7 +25,7 @@ from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.sections.material import from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene.build import ends_not_given, stage
+from jaxtrachea.scene.build import ends_not_given, material_of, stage
 from jaxtrachea.scene.declare import SECTIONS, SceneFacts
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.spec import SceneSpec
@@ -296,6 +296,29 @@ def test_material_of_a_file():
     ):
         with pytest.raises(ValueError, match=re.escape(says)):
             material(sections=low)
+
+
+def test_factors_that_are_left_of_another_tube_are_extrapolated():
+    """Estimates of a fit keep what the fit kept fixed, until that is named as well."""
+
+    def extrapolated(sections, wall=None, **model):
+        tables = {"sections": sections, "wall": wall or {"E_C": "9 MPa"}, "model": model}
+        spec = SceneSpec.model_validate(SCENE | tables)
+        return bool(material_of(spec, TUBE).extrapolated)
+
+    fitted = {"EI_C": "23 N mm^2", "bed_n": "0.02 N/mm^3", "bed_t": "0.002 N/mm^3",
+              "Et_L": "1.2 N/mm", "D_L": "4 N mm", "c_W": "0.9 1/N/mm"}  # fmt: skip
+    rest = {"Et_M": "0.6 N/mm", "Gt_L": "20 N/mm", "k_end": "0.16 1/mm", "footprint": 2.85,
+            "c_t": "0.1 mm/N", "c_t_ring": "0.1 mm/N"}  # fmt: skip
+    assert extrapolated({})
+    assert extrapolated(fitted)
+    assert extrapolated(fitted | {k: v for k, v in rest.items() if k != "footprint"})
+    assert not extrapolated(fitted | rest)
+    like = {"E_C": "5.8 MPa"}
+    assert not extrapolated({}, like)
+    assert extrapolated({}, like, half_width="2.4 mm")
+    spec = SceneSpec.model_validate(SCENE | {"wall": like, "model": {"half_width": "2.4 mm"}})
+    assert material_of(spec, TUBE).footprint == 1
 
 
 def test_cross_sections_are_not_traded():

@@ -379,8 +379,6 @@ WIDE = {"half_width": HALF}
         ({"friction": True, "slip": 1.0, "spacing": 10.0}, WIDE, "no friction"),
         ({"angle": 0.5}, WIDE | {"width": "punch"}, "'punch', but a width is for presses"),
         ({}, {"width": "punch"}, "'punch', but half_width is 0; give it, in .model."),
-        ({"known": frozenset({"sections"})}, WIDE | {"contact": "bonded", "want_surface": False},
-         "footprint of the tool; leave half_width out"),
         ({"spacing": 10.0}, {"half_width": 0.0024}, "next to a point .* 10 mm apart; check its un"),
     ],
 )  # fmt: skip

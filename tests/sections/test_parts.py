@@ -119,10 +119,10 @@ def test_the_place_of_a_contact():
     nodes = jnp.asarray([0.0, 9.0, 18.0])
     two = jax.tree.map(lambda v: jnp.stack([v, v]), one)
     A, C = wall_matrices(P)
-    place = jax.jit(lambda s: place_on(nodes, s, two, jnp.asarray(1.0)))
+    place = jax.jit(lambda s: place_on(nodes, s[None], two, jnp.asarray(1.0)))
     for s, x in ((9.0, 0.0), (9.4, 0.4), (13.5, 4.5), (17.0, 8.0), (18.0, 9.0)):
         got = place(jnp.asarray(s))
-        np.testing.assert_array_equal(got.shares[0], 0)
+        np.testing.assert_array_equal(got.shares[0, 0], 0)
         for parity, modes in enumerate(((0, 1, 2, 3), (4, 5, 6, 7))):
             for k, mode in enumerate(modes):
                 warp = np.flatnonzero(E[mode])
@@ -131,8 +131,8 @@ def test_the_place_of_a_contact():
                 psi = [4 + warp[0] % 3] if warp.size else []
                 full = np.zeros((2, 7))
                 full[:, [k, *psi]] = share.reshape(2, -1)
-                np.testing.assert_allclose(got.shares[1:, parity, k], full, atol=1e-9)
-                assert float(got.own[parity, k]) == pytest.approx(own, rel=1e-8, abs=1e-15)
+                np.testing.assert_allclose(got.shares[0, 1:, parity, k], full, atol=1e-9)
+                assert float(got.own[0, 0, parity, k]) == pytest.approx(own, rel=1e-8, abs=1e-15)
 
 
 def test_a_round_tool_rests_on_the_ring():

@@ -407,8 +407,14 @@ def test_refusals():
 
 
 @pytest.mark.slow
-def test_a_beam_on_springs_is_the_limit():
-    """Rings that do not bend and uncoupled modes: the paper's ligament with shear on k_M."""
+@pytest.mark.parametrize("half_width", [0.0, 2.4, 14.0])
+def test_a_beam_on_springs_is_the_limit(half_width):
+    """Rings that do not bend and uncoupled modes: the paper's ligament with shear on k_M.
+
+    Also under a punch, of which both edges are in one span, in two, and far apart. The line has one
+    local law for all of it, here each edge has its own: added by hand to the line's compliances at
+    the edges, with c_12 from that of the punch, w = (c_11 c_22 - c_12^2) / (c_11 + c_22 - 2 c_12).
+    """
     k_M, EI, GA, c_n = 0.216, 1402.0, 9.31, 0.003
     geometry = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=RADIUS)
     bed = k_M / (2 * np.pi / 3 * 10 * (RADIUS + 0.9))
@@ -421,13 +427,18 @@ def test_a_beam_on_springs_is_the_limit():
         "Gt_L": GA,
         "Et_L": EI,
     }
-    material = SectionMaterial(**(VALUES | rigid | {"k_end": np.inf, "footprint": 1.0, "D_L": 0.0}))
+    material = SectionMaterial(
+        **(VALUES | rigid | {"k_end": np.inf, "footprint": 1.0, "D_L": 0.0, "c_n": c_n})
+    )
     beam = Material(EI_L=EI, GA_L=GA, k_M=k_M, k_1=1 / c_n, k_3=0.0)
     options = mat.Options(shear=True)
+    wide = mat.Options(shear=True, half_width=half_width)
+    edges = jnp.asarray([-half_width, half_width] if half_width else [0.0])
 
     @jax.jit
     def force(s_c):
-        parts = build(geometry, material, s_c, 0 * s_c, jnp.asarray([1.0, 0.0]), midline=True)
+        along = jnp.asarray([1.0, 0.0])
+        parts = build(geometry, material, s_c, 0 * s_c, along, midline=True, half_width=half_width)
         forms = make_forms(parts.grid, parts.shape)
         forms = jax.tree.map(jnp.zeros_like, forms)._replace(
             shear_front=jnp.eye(4)[None] / RADIUS, stretch_front=jnp.eye(3)[None] / RADIUS**3
@@ -436,17 +447,25 @@ def test_a_beam_on_springs_is_the_limit():
         one = make_span(wall, jnp.asarray(10.0), forms, parts.shape)
         spans = jax.tree.map(lambda v: jnp.broadcast_to(v, (16, *v.shape)), one)
         nodes = jnp.concatenate([jnp.zeros(1), geometry.ring_positions, geometry.length[None]])
-        place = place_on(nodes, s_c, spans, jnp.asarray(1.0))
+        place = place_on(nodes, s_c + edges, spans, jnp.asarray(1.0))
         a_1 = jnp.asarray([[1.0, 0.0, 0.0, 0.0]])
-        place = place._replace(own=a_1 * place.own, shares=a_1[None, :, :, None] * place.shares)
+        place = place._replace(
+            own=a_1[None, None] * place.own, shares=a_1[None, None, :, :, None] * place.shares
+        )
         parts = parts._replace(spans=spans, place=place)
         r, tangent = system.linearise(system.at_rest(parts), jnp.asarray(1.0), parts)
-        return -system.solve_linear(tangent, r).force[0]
+        return -jnp.sum(system.solve_linear(tangent, r).force)
 
     @jax.jit
     def today(s_c):
-        return mat.press(geometry, beam, s_c, jnp.asarray([1.0]), options).force[0]
+        if half_width == 0:
+            return mat.press(geometry, beam, s_c, jnp.asarray([1.0]), options).force[0]
+        c_11, c_22 = mat.compliance(geometry, beam, s_c + edges, options)
+        w = mat.compliance(geometry, beam, s_c[None], wide)[0]
+        c_12 = w - jnp.sqrt((c_11 - w) * (c_22 - w))
+        c_11, c_22 = c_11 + 2 * c_n, c_22 + 2 * c_n
+        return (c_11 + c_22 - 2 * c_12) / (c_11 * c_22 - c_12**2)
 
-    for s in (3.0, 22.0, 70.0, 75.0, 107.0):
+    for s in (22.0, 70.0, 75.0, 107.0, *([] if half_width else [3.0])):
         s_c = jnp.asarray(s)
         assert float(force(s_c)) == pytest.approx(float(today(s_c)), rel=1e-6)

@@ -57,7 +57,7 @@ def force_alone(flat):
     """The force on the midline by the parts that solve for it: quicker to compile."""
     geometry, material, (s_c, phi_c, direction, path) = UNRAVEL(flat)
     parts = build(geometry, material, s_c, 0 * phi_c, direction, midline=True)
-    return solve_path(parts, path).state.force[-1]
+    return solve_path(parts, path).state.force[-1, 0]
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ class Options:
         skeleton: `linear`, or `softening` for deep presses: it yields more the further it moves
             (needs `Material.e_1` and `e_2`, and `series`); or `sections`, in fits: deforming
             cross-sections, anywhere on the rings and at finite strain (`bonded`; no other option
-            applies). `press_sections` presses that one.
+            but `half_width` applies). `press_sections` presses that one.
     """
 
     coupling: Literal["series", "total"] = "series"
@@ -84,7 +84,7 @@ class Options:
 _ONLY = {
     "sections": {
         "coupling": "series", "split": "continuous", "form": "recursion", "shear": False,
-        "local": "uniform", "transition": None, "half_width": 0.0, "contact": "bonded",
+        "local": "uniform", "transition": None, "contact": "bonded",
         "onset_width": 1e-3,
     },
 }  # fmt: skip

@@ -104,7 +104,10 @@ class Sections(Level):
         along = jnp.asarray([1.0, 0.0], dtype) if motion.direction is None else motion.direction
         D = motion.displacement
         moved = D if motion.onset is None else D - motion.onset
-        pressed = press_sections(tube, material, motion.s_c, phi_c, moved, along, midline=plain)
+        pressed = press_sections(
+            tube, material, motion.s_c, phi_c, moved, along, midline=plain,
+            half_width=self.options.half_width,
+        )  # fmt: skip
         frame = local_frame(phi_c)[::2]  # inward normal, circumference
         force, joints = pressed.force @ frame.T, pressed.joints @ frame.T
         across: Float[Array, 2] = jnp.stack([-along[1], along[0]])

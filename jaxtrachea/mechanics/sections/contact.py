@@ -7,10 +7,14 @@ of the outer surface at phi_c (inward normal, circumference), exact at any size.
 
 A round tool near a ring rests on the ring: it acts at `effective_place`, nearer to the ring than
 it is.
+
+A flat punch is two contacts, its edges, which move alike (`mechanics.punch`). In one span each
+moves the other, S is then a matrix of edges for every mode; in two spans neither does.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -19,17 +23,17 @@ from jaxtrachea.mechanics.sections.span import Span, selector
 
 
 class Place(NamedTuple):
-    """What a contact moves.
+    """What each contact moves: one of a point, two of a punch.
 
     Attributes:
-        shares: N, modes at the contact per unknown of each node; (nodes, parities, 4, 7).
-        own: S, diagonal, mm/N.
+        shares: N, modes at the contact per unknown of each node.
+        own: S, of the modes at one by the force on the same modes at another, mm/N.
         weight: of the wall between rings in the local compliance, 0 on a ring, 1 mid-span.
     """
 
-    shares: Float[Array, "nodes parities 4 7"]
-    own: Float[Array, "parities 4"]
-    weight: Float[Array, ""]
+    shares: Float[Array, "contacts nodes parities 4 7"]
+    own: Float[Array, "contacts contacts parities 4"]
+    weight: Float[Array, " contacts"]
 
 
 def effective_place(s_c: Float[Array, ""], left, right, footprint):
@@ -122,29 +126,34 @@ def own_deflection(
 
 def place_on(
     nodes: Float[Array, " nodes"],
-    s_c: Float[Array, ""],
+    s: Float[Array, " contacts"],
     spans: Span,
     footprint: Float[Array, ""],
 ) -> Place:
-    """The place of a contact.
+    """The places of contacts.
 
     Args:
         nodes: both ends of the tube and the rings between, mm.
-        s_c: contact position, mm, within the tube.
+        s: their positions, mm, within the tube.
         spans: all of them, stacked.
         footprint: see `effective_place`.
     """
-    j, x = acting_place(nodes, s_c, footprint)
-    h, stiff = spans.h[j], modal_stiffness(spans.shear[j], spans.axial[j])
-    E = jnp.asarray(selector(stiff.shear.shape[0], x.dtype))
-    (w_L, r_L), (w_R, r_R) = end_shares(x, h, stiff)
+    at = jax.vmap(lambda s: acting_place(nodes, s, footprint))
+    spans_of, loads = at(s)
 
-    def share(w, r):
-        held = jnp.eye(4, dtype=w.dtype)[None] * w[:, :, None]
-        return jnp.concatenate([held, E * r[:, :, None]], 2)
+    def one(s, j, x):
+        h, stiff = spans.h[j], modal_stiffness(spans.shear[j], spans.axial[j])
+        E = jnp.asarray(selector(stiff.shear.shape[0], x.dtype))
+        (w_L, r_L), (w_R, r_R) = end_shares(x, h, stiff)
 
-    none = jnp.zeros((nodes.shape[0], *E.shape[:2], 7), x.dtype)
-    shares = none.at[j].set(share(w_L, r_L)).at[j + 1].set(share(w_R, r_R))
-    own = own_deflection(x, x, h, stiff)
-    weight = jnp.sin(jnp.pi * (s_c - nodes[j]) / h) ** 2
-    return Place(shares, own, weight)
+        def share(w, r):
+            held = jnp.eye(4, dtype=w.dtype)[None] * w[:, :, None]
+            return jnp.concatenate([held, E * r[:, :, None]], 2)
+
+        none = jnp.zeros((nodes.shape[0], *E.shape[:2], 7), x.dtype)
+        shares = none.at[j].set(share(w_L, r_L)).at[j + 1].set(share(w_R, r_R))
+        both = jax.vmap(lambda load: own_deflection(x, load, h, stiff))(loads)
+        own = jnp.where((spans_of == j)[:, None, None], both, 0)
+        return Place(shares, own, jnp.sin(jnp.pi * (s - nodes[j]) / h) ** 2)
+
+    return jax.vmap(one)(s, spans_of, loads)

@@ -159,6 +159,8 @@ EACH_RING = ("EI_C", "EI_M", "Et_M", "bed_n", "bed_t", "c_K")
 EACH_SPAN = ("Gt_L", "Et_L", "D_L", "c_W", "rho")
 #: Values that must be more than zero; the others must not be negative.
 POSITIVE = ("EI_C", "EI_M", "Et_M", "Gt_L", "Et_L", "c_n", "c_t", "c_t_ring")
+#: Values that fits keep fixed and `from_wall` takes from `Factors`.
+FROM_FACTORS = ("Et_M", "Gt_L", "k_end", "footprint", "c_t", "c_t_ring")
 #: Smallest values where these are not 0.
 LEAST = {"footprint": 1.0}
 
@@ -274,6 +276,7 @@ def from_wall(
     wall: Wall = Wall(),
     factors: Factors = Factors(),  # noqa: B008 (frozen)
     tool_radius: float = TOOL_RADIUS,
+    half_width: float = 0.0,
 ) -> SectionMaterial:
     """Stiffnesses of the sections of a tube, from moduli and thicknesses.
 
@@ -285,9 +288,12 @@ def from_wall(
         wall: moduli and thicknesses.
         factors: what they leave open.
         tool_radius: of the tool's flat end, mm, which `c_t` and `c_t_ring` follow.
+        half_width: with which the tool will be pressed, mm. The edges of a punch rest on rings
+            where they are, so that its `footprint` is 1.
 
     Returns:
-        The stiffnesses; `extrapolated` where the tube is unlike the specimen (`proportions`).
+        The stiffnesses; `extrapolated` where the tube is unlike the specimen (`proportions`), or
+        the tool has a width: `Factors` were found with a point.
     """
     pitches = ring_pitches(geometry)
     plane = 1 - wall.nu**2
@@ -308,15 +314,36 @@ def from_wall(
         "c_W": factors.c_W / (wall.E_L * wall.h * R * mean_span),
         "c_end": factors.c_end,
         "k_end": factors.k_end / R,
-        "footprint": factors.footprint,
+        "footprint": 1.0 if half_width > 0 else factors.footprint,
     }
     slides = (2 - wall.nu) * (1 + wall.nu) / (4 * wall.E_L * tool_radius)
     values["c_t"] = values["c_t_ring"] = factors.slide * slides
-    off = jnp.abs(
-        jnp.log(proportions(geometry, wall, tool_radius) / jnp.asarray(_SPECIMEN, R.dtype))
-    )
-    values["extrapolated"] = jnp.any(off > float(np.log(ALIKE))).astype(R.dtype)
+    apart = _apart(geometry, wall, tool_radius)
+    unlike = jnp.any(apart > float(np.log(ALIKE))) | (half_width > 0)
+    values["extrapolated"] = unlike.astype(R.dtype)
     return SectionMaterial(**values)
+
+
+def _apart(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Array, "12"]:
+    """How far each proportion is from the specimen's, as a logarithm."""
+    given = proportions(geometry, wall, tool_radius)
+    return jnp.abs(jnp.log(given / jnp.asarray(_SPECIMEN, given.dtype)))
+
+
+def furthest_proportion(geometry: Geometry, wall: Wall, tool_radius: float) -> str:
+    """The proportion that is least like the specimen's, in words; empty: `Factors` hold.
+
+    Args:
+        geometry: the tube.
+        wall: moduli and thicknesses.
+        tool_radius: of the tool's flat end, mm.
+    """
+    apart = np.asarray(_apart(geometry, wall, tool_radius))
+    if not apart.max() > np.log(ALIKE):
+        return ""
+    i = int(np.argmax(apart))
+    given = float(proportions(geometry, wall, tool_radius)[i])
+    return f"{_PROPORTIONS[i]} is {given:.3g}, there {_SPECIMEN[i]:.3g}"
 
 
 #: Largest ratio of a proportion to the specimen's with which `Factors` hold
@@ -348,6 +375,11 @@ def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Arr
     return jnp.stack([jnp.asarray(value, R.dtype) for value in values])
 
 
+_PROPORTIONS = (
+    "pitch over radius", "height of a ring over pitch", "half-angle of a ring in rad",
+    "h over radius", "h_C over h", "h_M over h", "E_C over E_L", "E_M over E_L", "1 + nu",
+    "bed_n R over E_M", "bed_t R over E_M", "gap between rings over the tool's radius",
+)  # fmt: skip
 #: `proportions` of the specimen (docs/evidence/virtual_trachea.md) with its punch of 3 mm.
 _SPECIMEN = np.array([
     10 / 11.7, 0.4, 2 * np.pi / 3, 2.6 / 11.7, 0.6, 2 / 2.6, 5.8 / 0.65, 0.3 / 0.65, 1.45,

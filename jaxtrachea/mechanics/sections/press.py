@@ -97,6 +97,7 @@ def press_sections(
     *,
     midline: bool = False,
     places: ArrayLike | None = None,
+    half_width: float = 0.0,
 ) -> SectionPress:
     """Press or draw the tool, stuck to the surface at (s_c, phi_c), along a path from rest.
 
@@ -115,6 +116,9 @@ def press_sections(
         midline: a program for phi_c = 0 and a normal direction only, a quarter of the work; other
             presses are OFF_PLAN in it.
         places: positions along the tube, mm, where the sections' modes are wanted; None: nowhere.
+        half_width: of a flat punch along the tube, mm: two forces, that far before and behind s_c,
+            hold the wall level (static, as in `Options`). All of it has to lie on the tube, else
+            OFF_TUBE. `skeleton` and `depth` are means of both edges. 0: the tool is a point.
 
     Returns:
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
@@ -134,12 +138,15 @@ def press_sections(
     s_c = shaped("s_c", s_c, (), dtype=dtype, why="; use jax.vmap for many positions")
     if places is not None:
         places = shaped("places", places, ("any number of",), dtype=dtype)
-    return _press(geometry, material, s_c, phi_c, displacement, direction, places, midline)
+    if not 0 <= half_width < np.inf:
+        raise ValueError(f"half_width is {half_width:g} mm; expected 0 or more")
+    arrays = s_c, phi_c, displacement, direction, places
+    return _press(geometry, material, *arrays, midline, float(half_width))
 
 
 # Inlined: the program is as without. But what calls it is traced through derivatives and maps from
 # equations that are known, in all programs for the same shapes, and not through its Python again.
-@functools.partial(jax.jit, static_argnames="midline", inline=True)
+@functools.partial(jax.jit, static_argnames=("midline", "half_width"), inline=True)
 @full_precision
 def _press(
     geometry: Geometry,
@@ -150,10 +157,11 @@ def _press(
     direction: Float[Array, "2"],
     places: Float[Array, " k"] | None,
     midline: bool,
+    half_width: float,
 ) -> SectionPress:
     """`press_sections` of arrays."""
-    asked = _admit(geometry, material, s_c, phi_c, direction, midline)
-    parts = build(geometry, *asked[:4], midline=midline)
+    asked = _admit(geometry, material, s_c, phi_c, direction, midline, half_width)
+    parts = build(geometry, *asked[:4], midline=midline, half_width=half_width)
     known = jnp.isfinite(displacement)
     path = jnp.where(known, displacement, 0)
     solved = solve_path(parts, path)
@@ -165,7 +173,7 @@ def _press(
         nodes = ends_and_rings(geometry)
         footprint = asked.material.footprint.astype(displacement.dtype)
         along = jax.vmap(_along, (0, None, None, None, None))
-        contact = asked.s_c, footprint
+        contact = _edges(asked.s_c, half_width), footprint
         found = found._replace(along=along(solved.state, places, nodes, contact, parts))
     found = found._replace(steps=solved.steps, status=status)
     valid = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
@@ -192,8 +200,9 @@ class _Asked(NamedTuple):
     refused: Int[Array, ""]
 
 
-def _admit(geometry, material, s_c, phi_c, direction, midline) -> _Asked:
-    off_tube = ~((s_c >= 0) & (s_c <= geometry.length))
+def _admit(geometry, material, s_c, phi_c, direction, midline, half_width) -> _Asked:
+    edges = s_c - half_width, s_c + half_width
+    off_tube = ~((edges[0] >= 0) & (edges[1] <= geometry.length))
     on, phi = on_ring(geometry.half_angle, phi_c)
     material, bad, unknown = safe_values(material)
     place = jnp.isfinite(s_c) & jnp.isfinite(phi_c) & jnp.all(jnp.isfinite(direction))
@@ -223,6 +232,13 @@ def safe_values(material: SectionMaterial) -> tuple[dict[str, Any], Array, Array
     return safe, bad, unknown
 
 
+def _edges(s_c: Float[Array, ""], half_width: float) -> Float[Array, " contacts"]:
+    """Where the tool touches, mm: at one point, or with both edges of a punch."""
+    if half_width == 0:
+        return s_c[None]
+    return s_c + half_width * jnp.asarray([-1.0, 1.0], s_c.dtype)
+
+
 #: Names of the bed in the equations of a ring.
 _OF_RING = {"bed_n": "k_n", "bed_t": "k_t"}
 
@@ -235,6 +251,7 @@ def build(
     direction: Float[Array, "2"],
     *,
     midline: bool,
+    half_width: float = 0.0,
 ) -> System:
     """The system of a press, of arguments that are checked."""
     n, dtype = geometry.rings, geometry.length.dtype
@@ -251,8 +268,8 @@ def build(
     make = jax.vmap(span.make_span, (0, 0, None, None))
     spans = make(span.Wall(**per_span), jnp.diff(nodes), forms, shape)
     scale, ends = _hold_ends(spans, values["k_end"])
-    place = place_on(nodes, s_c, spans, values["footprint"])
-    mixed = values["c_t_ring"] + place.weight * (values["c_t"] - values["c_t_ring"])
+    place = place_on(nodes, _edges(s_c, half_width), spans, values["footprint"])
+    mixed = values["c_t_ring"] + jnp.mean(place.weight) * (values["c_t"] - values["c_t_ring"])
     count = 1 if midline else 2
     give = jnp.stack([values["c_n"], mixed])[:count]
     return System(
@@ -295,7 +312,7 @@ def _imbalance(line: section.Line, state: State, displacement, parts: System):
     """Largest residual of the nodes over the force."""
     line, state, displacement, parts = jax.lax.stop_gradient((line, state, displacement, parts))
     r = system.residual_of(line, state, displacement, parts)
-    pushed = largest(jnp.abs(state.force))
+    pushed = largest(jnp.abs(state.force).ravel())
     return largest(jnp.abs(r.y).ravel()) / jnp.where(pushed > 0, pushed, 1)
 
 
@@ -307,13 +324,13 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
         return v @ frame[: v.shape[0]]
 
     line = system.lines(state, parts)
-    v = system.contact_surface(state, line, parts).motion
+    v = jnp.mean(system.contact_surface(state, line, parts).motion, 0)
     modes = system.ring_modes(state, parts)
     alpha = parts.shape.half_angle
     angles = jnp.stack([parts.phi_c, -alpha, alpha])
-    joints, end_U, end_V = _ring_motion(system.of_rings(line), angles, parts)
+    joints, end_U, end_V = _ring_motion(system.of_rings(line, parts), angles, parts)
     return SectionPress(
-        force=vector(state.force),
+        force=vector(jnp.sum(state.force, 0)),
         depth=vector(displacement * parts.direction - v),
         skeleton=vector(v),
         modes=jnp.pad(modes, ((0, 0), (0, 8 - modes.shape[1]))),
@@ -328,13 +345,16 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
 
 
 def _along(state: State, places, nodes, contact, parts: System):
-    """Modes of the sections at each place, for a contact (s_c, footprint)."""
-    line = system.lines(state, parts)
-    slope = system.contact_surface(state, line, parts).slope
-    pushed = (slope.T @ state.force).reshape(state.q_C.shape)
+    """Modes of the sections at each place, for contacts (their positions, footprint)."""
+    surface = system.contact_surface(state, system.lines(state, parts), parts)
+    pushed = system.pushed_modes(surface, state).reshape(state.q_C.shape)
     unknowns = system.physical(state, parts)
-    acting = Contact(contact[0], contact[1], pushed)
-    return modes_along(places, nodes, unknowns, parts.spans, acting)
+
+    def moved(s, pushed):
+        return modes_along(places, nodes, unknowns, parts.spans, Contact(s, contact[1], pushed))
+
+    each = jax.vmap(moved)(contact[0], pushed)
+    return WallModes(each.carried[0], jnp.sum(each.own, 0))
 
 
 def _ring_motion(line: section.Line, angles, parts: System):

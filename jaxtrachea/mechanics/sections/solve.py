@@ -74,9 +74,10 @@ def _flat(state: State):
 
 def _state(z, system: System) -> State:
     """The state of a flat array."""
-    y, q, count = system.scale.shape, system.place.own.shape, system.give.shape[0]
-    end = math.prod(y)
-    return State(z[:end].reshape(y), z[end:-count].reshape(q), z[-count:])
+    rest = jax.eval_shape(_system.at_rest, system)
+    end, count = math.prod(rest.y.shape), math.prod(rest.force.shape)
+    parts = z[:end], z[end:-count], z[-count:]
+    return State(*(v.reshape(like.shape) for v, like in zip(parts, rest, strict=True)))
 
 
 def _choose(condition, a, b):
@@ -116,7 +117,9 @@ def _newton(z, displacement, system: System):
     if system.grid.midline:  # With blocks of 14 x 14 the library is quicker.
         assemble = one_kernel(assemble, products=True)
     r, tangent = assemble(found, state, displacement, system)
-    along = jax.tree.map(jnp.zeros_like, r)._replace(force=system.direction)
+    along = jax.tree.map(jnp.zeros_like, r)._replace(
+        force=jnp.broadcast_to(system.direction, r.force.shape)
+    )
     both = jax.tree.map(lambda x, y: jnp.stack([x, y]), r, along)
     both = one_kernel(_system.solve_several, products=True)(tangent, both)
     step, slope = jax.vmap(_flat)(both)

@@ -1,7 +1,9 @@
 r"""Rings, spans, ends and contact together: residual, tangent and linear solution.
 
 Unknowns z = (y, q_C, F): y = (q, psi) of every node (both ends of the tube and the rings), the
-modes q_C of the section at the contact, and the contact's force. Residual:
+modes q_C of the section at the contact, and the contact's force. A punch has two contacts, its
+edges: N, S, q_C and F are those of both, and each takes its own share of the local compliance.
+Residual:
 
     r_y = dU/dy + dW/dy - N^T B^T F,   r_q = q_C - N y - S B^T F,   r_F = v(q_C) - D e + give F
 
@@ -42,13 +44,13 @@ class State(NamedTuple):
     Attributes:
         y: of each node, four modes q, mm, and three rotations psi, by parity; those of the ends
             are scaled.
-        q_C: modes at the contact, mm.
+        q_C: modes at each contact, mm.
         force: of the tool on the wall, inward and (off the midline) along the circumference, N.
     """
 
     y: Float[Array, "*s nodes parities 7"]
-    q_C: Float[Array, "*s parities 4"]
-    force: Float[Array, "*s directions"]
+    q_C: Float[Array, "*s contacts parities 4"]
+    force: Float[Array, "*s contacts directions"]
 
 
 class System(NamedTuple):
@@ -61,9 +63,9 @@ class System(NamedTuple):
         spans: stacked.
         scale: physical unknowns over y: 1, less for psi of the ends, 0 for their q.
         ends: stiffness of psi at both ends, scaled.
-        place: of the contact.
-        phi_c: its angle, rad.
-        give: local compliance, inward and along the circumference, mm/N.
+        place: of the contacts.
+        phi_c: their angle, rad.
+        give: local compliance of the tool, inward and along the circumference, mm/N.
         direction: of the tool's displacement, likewise.
     """
 
@@ -90,27 +92,26 @@ class Tangent(NamedTuple):
         factors: of K_T + N^T E N, block tridiagonal.
         share: N, scaled, by unknown: each belongs to one mode only.
         own: S.
-        stiffness: E, N/mm; (modes, modes).
-        B: dv/dq; (directions, modes).
-        M: N/mm.
-        give: mm/N.
+        stiffness: E, N/mm; between the modes at each contact.
+        B: dv/dq.
+        give: of one contact, mm/N.
         negative: negative pivots of I + S M.
     """
 
     factors: block.Factors
-    share: Float[Array, "nodes m"]
-    own: Float[Array, " modes"]
-    stiffness: Float[Array, "modes modes"]
-    B: Float[Array, "directions modes"]
-    M: Float[Array, "modes modes"]
+    share: Float[Array, "contacts nodes m"]
+    own: Float[Array, "contacts contacts modes"]
+    stiffness: Float[Array, "contacts modes contacts modes"]
+    B: Float[Array, "contacts directions modes"]
     give: Float[Array, " directions"]
     negative: Int[Array, ""]
 
 
 def at_rest(system: System) -> State:
     """The undeformed state."""
-    zeros = jnp.zeros_like
-    return State(zeros(system.scale), zeros(system.place.own), zeros(system.give))
+    own = system.place.own
+    force = jnp.zeros((own.shape[0], *system.give.shape), own.dtype)
+    return State(jnp.zeros_like(system.scale), jnp.zeros_like(own[0]), force)
 
 
 def physical(state: State, system: System) -> Float[Array, "nodes parities 7"]:
@@ -125,20 +126,22 @@ def ring_modes(state: State, system: System) -> Float[Array, "rings modes"]:
 
 
 def lines(state: State, system: System) -> Line:
-    """The rings' mid-lines and, last, that of the section at the contact."""
-    q = jnp.concatenate([ring_modes(state, system), state.q_C.reshape(1, -1)])
+    """The rings' mid-lines and, last, those of the sections at the contacts."""
+    q_C = state.q_C.reshape(state.q_C.shape[0], -1)
+    q = jnp.concatenate([ring_modes(state, system), q_C])
     return jax.vmap(deform, (0, None, None))(q, system.grid, system.shape)
 
 
-def of_rings(line: Line) -> Line:
+def of_rings(line: Line, system: System) -> Line:
     """Those of `lines` that are rings."""
-    return jax.tree.map(lambda v: v[:-1], line)
+    return jax.tree.map(lambda v: v[: system.scale.shape[0] - 2], line)
 
 
 def contact_surface(state: State, line: Line, system: System) -> Surface:
-    """Motion of the outer surface at the contact, from `lines`."""
-    line = jax.tree.map(lambda v: v[-1], line)
-    return surface_tangent(line, system.phi_c, state.force, system.grid, system.shape)
+    """Motion of the outer surface at each contact, from `lines`."""
+    line = jax.tree.map(lambda v: v[system.scale.shape[0] - 2 :], line)
+    surface = jax.vmap(surface_tangent, (0, None, 0, None, None))
+    return surface(line, system.phi_c, state.force, system.grid, system.shape)
 
 
 def _mode_of(parities: int) -> np.ndarray:
@@ -148,21 +151,33 @@ def _mode_of(parities: int) -> np.ndarray:
 
 
 def _share(system: System):
-    """N by unknown, (nodes, m): no unknown moves two modes."""
-    nodes = system.scale.shape[0]
-    return (jnp.sum(system.place.shares, 2) * system.scale).reshape(nodes, -1)
+    """N by unknown, (contacts, nodes, m): no unknown moves two modes."""
+    shares = jnp.sum(system.place.shares, 3) * system.scale[None]
+    return shares.reshape(*shares.shape[:2], -1)
 
 
 def _gather(share, y):
-    """N y of scaled unknowns (nodes, m); (modes,)."""
-    moved = jnp.sum(share * y, 0).reshape(-1, 7)
-    E = jnp.asarray(selector(moved.shape[0], moved.dtype))
-    return (moved[:, :4] + jnp.sum(E * moved[:, None, 4:], 2)).ravel()
+    """N y of scaled unknowns (nodes, m); (contacts, modes)."""
+    moved = jnp.sum(share * y[None], 1).reshape(share.shape[0], -1, 7)
+    E = jnp.asarray(selector(moved.shape[1], moved.dtype))
+    return (moved[..., :4] + jnp.sum(E[None] * moved[:, :, None, 4:], 3)).reshape(
+        share.shape[0], -1
+    )
 
 
 def _spread(share, g):
     """N^T g, scaled; (nodes, m)."""
-    return share * g[_mode_of(share.shape[1] // 7)][None]
+    return jnp.sum(share * g[:, None, _mode_of(share.shape[2] // 7)], 0)
+
+
+def _own_part(own, g):
+    """S g; (contacts, modes)."""
+    return jnp.sum(own * g[None], 1)
+
+
+def _by_modes(own):
+    """S with the modes of both parities in one row; (contacts, contacts, modes)."""
+    return own.reshape(*own.shape[:2], -1)
 
 
 def _pairs(Y):
@@ -194,13 +209,24 @@ def _assemble(span, ring, state: State, system: System, g):
 
 
 def _contact(state: State, displacement, system: System, surface: Surface):
-    """r_q and r_F, and the force on the modes."""
-    g = surface.slope.T @ state.force
+    """r_q and r_F, and the force on the modes at each contact."""
+    g = pushed_modes(surface, state)
     nodes = system.scale.shape[0]
     follows = _gather(_share(system), state.y.reshape(nodes, -1))
-    r_q = state.q_C.ravel() - follows - system.place.own.ravel() * g
-    r_F = surface.motion - displacement * system.direction + system.give * state.force
+    r_q = state.q_C.reshape(g.shape) - follows - _own_part(_by_modes(system.place.own), g)
+    way = displacement * system.direction
+    r_F = surface.motion - way[None] + _give_each(system)[None] * state.force
     return r_q.reshape(state.q_C.shape), r_F, g
+
+
+def pushed_modes(surface: Surface, state: State) -> Float[Array, "contacts modes"]:
+    """B^T F, the force on the modes at each contact, N."""
+    return jnp.sum(surface.slope * state.force[:, :, None], 1)
+
+
+def _give_each(system: System):
+    """Local compliance of one contact: alike under all, they are the tool's together."""
+    return system.give * system.place.own.shape[0]
 
 
 def residual(state: State, displacement: Float[Array, ""], system: System) -> State:
@@ -214,7 +240,7 @@ def residual_of(line: Line, state: State, displacement: Float[Array, ""], system
     r_q, r_F, g = _contact(state, displacement, system, surface)
     span = jax.vmap(span_forces)(_pairs(physical(state, system)), system.spans)
     rings = jax.vmap(line_forces, (0, 0, None, None))
-    ring = rings(of_rings(line), system.rings, system.grid, system.shape)
+    ring = rings(of_rings(line, system), system.rings, system.grid, system.shape)
     return State(_assemble(span, ring, state, system, g), r_q, r_F)
 
 
@@ -240,7 +266,8 @@ def elements(line: Line, state: State, system: System) -> Elements:
     """Forces and stiffness of rings and spans, where the mid-lines are known."""
     spans = jax.vmap(span_tangent)(_pairs(physical(state, system)), system.spans)
     rings = jax.vmap(line_tangent, (0, 0, None, None))
-    return Elements(line, *spans, *rings(of_rings(line), system.rings, system.grid, system.shape))
+    ring = rings(of_rings(line, system), system.rings, system.grid, system.shape)
+    return Elements(line, *spans, *ring)
 
 
 def linearise(
@@ -257,18 +284,30 @@ def assemble(
     surface = contact_surface(state, found.line, system)
     r_q, r_F, g = _contact(state, displacement, system, surface)
     r = State(_assemble(found.span, found.ring, state, system, g), r_q, r_F)
-    B, own, share = surface.slope, system.place.own.ravel(), _share(system)
-    M = (B.T / system.give[None]) @ B - surface.curved
-    inverse, negative = block.invert(jnp.eye(own.size, dtype=own.dtype) + own[:, None] * M)
-    E = M @ inverse
+    B, own, share = surface.slope, _by_modes(system.place.own), _share(system)
+    give = _give_each(system)
+    E, negative = _contact_stiffness(B, own, surface.curved, give)
     diagonal, upper = stiffness(found.of_span, found.of_ring, system)
     mode = _mode_of(system.scale.shape[1])
-    felt = E[mode[:, None], mode[None]][None]
-    diagonal = diagonal + felt * share[:, :, None] * share[:, None]
-    after = jnp.concatenate([share[1:], jnp.zeros_like(share[:1])])
-    upper = upper + felt * share[:, :, None] * after[:, None]
+    after = jnp.pad(share[:, 1:], ((0, 0), (0, 1), (0, 0)))
+    # Contacts in two spans do not meet in E: whatever is not next to each other stays so.
+    for i, j in np.ndindex(own.shape[:2]):
+        felt = E[i, :, j][mode[:, None], mode[None]][None] * share[i][:, :, None]
+        diagonal, upper = diagonal + felt * share[j][:, None], upper + felt * after[j][:, None]
     factors = block.factor(diagonal, upper)
-    return r, Tangent(factors, share, own, E, B, M, system.give, negative)
+    return r, Tangent(factors, share, own, E, B, give, negative)
+
+
+def _contact_stiffness(B, own, curved, give):
+    """E = M (I + S M)^-1 with M = B^T B / give - H of each contact; negative pivots of I + S M."""
+    count, modes = own.shape[1:]
+    M = [(b.T / give[None]) @ b - h for b, h in zip(B, curved, strict=True)]
+    rows = [[own[i, j][:, None] * M[j] for j in range(count)] for i in range(count)]
+    matrix = jnp.eye(count * modes, dtype=own.dtype) + jnp.block(rows)
+    inverse, negative = block.invert(matrix)
+    parts = inverse.reshape(count, modes, -1)
+    E = jnp.stack([m @ part for m, part in zip(M, parts, strict=True)])
+    return E.reshape(count, modes, count, modes), negative
 
 
 def stiffness(
@@ -310,14 +349,17 @@ def solve_several(tangent: Tangent, r: State) -> State:
     share, own, E = tangent.share, tangent.own, tangent.stiffness
 
     def condense(r):
-        b = tangent.B.T @ (r.force / tangent.give)
-        fixed = r.q_C.ravel() + own * b
-        return r.y.reshape(share.shape) + _spread(share, b - E @ fixed), fixed
+        b = jnp.sum(tangent.B * (r.force / tangent.give[None])[:, :, None], 1)
+        fixed = r.q_C.reshape(b.shape) + _own_part(own, b)
+        return r.y.reshape(share.shape[1:]) + _spread(share, b - felt(fixed)), fixed
+
+    def felt(q):
+        return (E.reshape(q.size, -1) @ q.ravel()).reshape(q.shape)
 
     def expand(r, y, fixed):
         moved = _gather(share, y) + fixed
-        q = moved - own * (E @ moved)
-        force = (r.force - tangent.B @ q) / tangent.give
+        q = moved - _own_part(own, felt(moved))
+        force = (r.force - jnp.sum(tangent.B * q[:, None], 2)) / tangent.give[None]
         return State(y.reshape(r.y.shape), q.reshape(r.q_C.shape), force)
 
     rhs, fixed = jax.vmap(condense, out_axes=(2, 0))(r)
@@ -346,9 +388,10 @@ def stored_energy(state: State, system: System) -> Float[Array, ""]:
 def stored_energy_of(line: Line, state: State, system: System) -> Float[Array, ""]:
     """`stored_energy` where the mid-lines are known."""
     rings = jax.vmap(line_energy, (0, 0, None, None))
-    in_rings = rings(of_rings(line), system.rings, system.grid, system.shape)
+    in_rings = rings(of_rings(line, system), system.rings, system.grid, system.shape)
     spans = jax.vmap(span_energy)(_pairs(physical(state, system)), system.spans)
     ends = jnp.sum(state.y * _held_ends(state.y, system)) / 2
-    g = (contact_surface(state, line, system).slope.T @ state.force).reshape(state.q_C.shape)
-    own = jnp.sum(system.place.own * g * g) + jnp.sum(system.give * state.force**2)
+    g = pushed_modes(contact_surface(state, line, system), state)
+    own = jnp.sum(g * _own_part(_by_modes(system.place.own), g))
+    own = own + jnp.sum(_give_each(system)[None] * state.force**2)
     return jnp.sum(in_rings) + jnp.sum(spans) + ends + own / 2
