@@ -113,7 +113,7 @@ class Plan:
         Raises:
             InputError: naming the option.
         """
-        if self.has("width") and self.second_plane and not self.level.off_midline:
+        if self.has("width") and self.second_plane and not self.mechanics.off_midline:
             raise InputError(
                 f"is {self.options.half_width:g}, with second_plane 'on'", joint=" ",
                 key="options.half_width", expected="0.0, or second_plane 'off'",

@@ -26,6 +26,7 @@ from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.predict import predict_sources
@@ -203,7 +204,7 @@ def test_an_angle_that_sections_were_not_tested_at_is_refused(half_angle, most):
 
     geometry = Geometry.create(160.0, [40.0, 80.0], half_angle=np.radians(half_angle))
     options = Options(skeleton="sections", contact="bonded")
-    model = SimpleNamespace(options=options, geometry=geometry)
+    model = SimpleNamespace(options=options, geometry=geometry, level=level_of(options))
     fit = object.__new__(FitResult)
     object.__setattr__(fit, "study", SimpleNamespace(model=model))
     for phi in (0.0, most, -most):
