@@ -327,14 +327,15 @@ def _print_rows(out) -> None:
             return float(np.round(x, 9) + 0.0)
 
         vectors = {"force {} [N]": out.force[i], "skeleton {} [mm]": out.skeleton[i]}
-        return {
+        cells: dict[str, object] = {
             "row": i + 1,
             "s [mm]": float(out.s[i]),
             "phi [deg]": rounded(np.degrees(out.phi[i])),
             "gap [mm]": None if out.gap is None else rounded(out.gap[i]),
             "status": PressStatus(int(out.status[i])).name.lower(),
             "depth/radius": float(out.depth_share[i]),
-        } | {
+        }
+        return cells | {
             name.format(axis): rounded(v)
             for name, vector in vectors.items()
             for axis, v in zip("xyz", np.asarray(vector), strict=True)

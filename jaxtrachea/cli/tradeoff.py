@@ -141,8 +141,8 @@ def _print(rows) -> None:
         body = [cells(point) for point in points if point["kind"] == kind]
         if body:
             head = [HEAD[i] for i in keep]
-            rows = [[row[i] for i in keep] for row in body]
-            out.print(table(words(title, head, rows, ("level",))))
+            shown = [[row[i] for i in keep] for row in body]
+            out.print(table(words(title, head, shown, ("level",))))
     for row in rows:
         if "left_out" in row:
             text = f"left out: {row['ladder']}: {row['left_out']}"

@@ -37,7 +37,6 @@ def evaluated(study: Study) -> FitResult:
     total = np.sum(info.counts, axis=1)
     half = half_widths(total, noise_known=study.noise_known)
     none = np.zeros((lanes, 0))
-    counts = {"iterations": np.zeros(lanes, int), "tried": np.ones(lanes, int)}
     return FitResult(
         study=study, theta=none, value=none, standard_error=none, lower=none, upper=none,
         relative_se=none, at_bound=none.astype(bool),
@@ -47,7 +46,7 @@ def evaluated(study: Study) -> FitResult:
         uncertainty=_no_uncertainty(half), undetermined=none.astype(bool),
         unexamined=none.astype(bool),
         evidence_low=none, evidence_high=none, evidence_end=np.zeros((lanes, 0, 2), int),
-        minima=np.ones(lanes, int), **counts,
+        minima=np.ones(lanes, int), iterations=np.zeros(lanes, int), tried=np.ones(lanes, int),
     )  # fmt: skip
 
 

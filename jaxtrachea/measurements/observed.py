@@ -5,6 +5,7 @@ Roles, readers, writers and checks loop over `OBSERVED`. A new quantity is a row
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,13 @@ class Quantity:
         return (samples, rings, *([len(self.components)] if self.components else []))
 
 
-_MARKERS = {"role": "joint", "dimension": "length", "unit": "mm", "rings": "joint_rings"}
-_ENDS = {
+_MARKERS: dict[str, Any] = {
+    "role": "joint",
+    "dimension": "length",
+    "unit": "mm",
+    "rings": "joint_rings",
+}
+_ENDS: dict[str, Any] = {
     "role": "end", "dimension": "length", "unit": "mm", "rings": "end_rings",
     "components": ("y", "z"), "largest": "max_displacement", "vector": True,
 }  # fmt: skip

@@ -99,6 +99,6 @@ def pressed(result: FitResult) -> Pressed:
             lane=lane,
             first_touch=result.first_touch[lane, trial],
             force_offset=offsets(study, result.theta)[lane, trial],
-            blend=np.full(len(rows), np.nan) if blend is None else blend[lane, trial],
+            blend=np.full(len(rows), np.nan) if blend is None else np.asarray(blend)[lane, trial],
         )
     return _KEPT[result]

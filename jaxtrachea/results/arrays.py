@@ -1,6 +1,7 @@
 """A fit as named arrays with a leading axis of lanes, and back; where each lies in results.h5."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +73,7 @@ def result_of(study: Study, arrays: dict[str, np.ndarray]) -> FitResult:
     keys = (STORED_AS.get(name, name) for name in Uncertainty._fields)
     local = Uncertainty(*(arrays[f"uncertainty.{key}"] for key in keys))
     said = Criteria(*(arrays[f"criteria.{name}"] for name in Criteria._fields))
-    fields = {name: arrays[name] for name in FIELDS}
+    fields: dict[str, Any] = {name: arrays[name] for name in FIELDS}
     study = _with_noise_found(study, arrays)
     return FitResult(study=study, criteria=said, uncertainty=local, **fields)
 

@@ -213,7 +213,7 @@ def _study(file: Any, model: dict[str, Any], place: _Places, curves: tuple[Curve
 
 def _lanes(data: Any, place: _Places, arrays: dict[str, np.ndarray]) -> Lane:
     """The lanes out of what is stored of them, and of the curves."""
-    observed = {"displacement": place.spread(numeric(data, "displacement"))}
+    observed: dict[str, Any] = {"displacement": place.spread(numeric(data, "displacement"))}
     for name, precision in FORCES + MARKERS:
         weight = arrays.get(precision)
         if weight is None:
@@ -221,17 +221,19 @@ def _lanes(data: Any, place: _Places, arrays: dict[str, np.ndarray]) -> Lane:
             continue
         values = place.spread(numeric(data, name))
         observed[name] = values if name == "force" else np.where(weight > 0, values, 0.0)
-    return Lane(**{"blend": None} | arrays | observed)
+    every: dict[str, Any] = {"blend": None} | arrays | observed
+    return Lane(**every)
 
 
 def _residuals(data: Any, place: _Places, lanes: Lane) -> Prediction:
     """Model minus data, as the fit has left it."""
-    found = {
+    found: dict[str, Any] = {"joints": None}
+    found |= {
         name: place.spread(numeric(data, column), np.nan)
         for name, column in RESIDUALS.items()
         if getattr(lanes, name) is not None
     }
-    return Prediction(**{"joints": None} | found)
+    return Prediction(**found)
 
 
 def _pair(found: Any) -> tuple[float, float] | None:
