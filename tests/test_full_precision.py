@@ -29,7 +29,7 @@ from jaxtrachea.fitting.cost import evaluate
 from jaxtrachea.fitting.information import information
 from jaxtrachea.mechanics.reactions import deflect_dense
 from jaxtrachea.mechanics.sections.material import from_wall
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.scene import session
 from jaxtrachea.scene.simulation import surface
 from jaxtrachea.trachea.geometry import Geometry
@@ -60,7 +60,9 @@ def sections(phi):
     wall = from_wall(SHORT)
 
     def force(s):
-        return press_sections(SHORT, wall, s, phi, PATH, midline=phi == 0).force
+        return press_sections(
+            SHORT, wall, s, phi, PATH, options=SectionOptions(midline=phi == 0)
+        ).force
 
     return force
 

@@ -211,7 +211,7 @@ def _study(file: Any, model: dict[str, Any], place: _Places, curves: tuple[Curve
     return study
 
 
-def _lanes(data: Any, place: _Places, arrays: dict[str, np.ndarray]) -> Lane:
+def _lanes(data: Any, place: _Places, arrays: dict[str, Any]) -> Lane:
     """The lanes out of what is stored of them, and of the curves."""
     observed: dict[str, Any] = {"displacement": place.spread(numeric(data, "displacement"))}
     for name, precision in FORCES + MARKERS:

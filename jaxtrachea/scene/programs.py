@@ -16,7 +16,7 @@ from jaxtrachea.mechanics.press import (
     unit_deflection,
 )
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.stage import Presses, Scene
@@ -148,7 +148,7 @@ def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) ->
         places = None if points is None else jnp.append(points, s)
         found = press_sections(
             scene.geometry, material, s, jnp.zeros_like(phi) if flat else phi, size[None],
-            direction, midline=flat, places=places, half_width=scene.plan.options.half_width,
+            direction, options=SectionOptions(flat, scene.plan.options.half_width), places=places,
         )  # fmt: skip
         return jax.tree.map(lambda v: v[0], found)
 

@@ -14,7 +14,7 @@ from jaxtrachea.mechanics.oblique import press_oblique
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.needs import off_midline
@@ -165,8 +165,8 @@ def _sections(scene: Scene, material: SectionMaterial, s_c, phi_c, depth) -> _Pr
     on = on_ring(scene.geometry.half_angle, phi_c)[0]
     at = jnp.zeros_like(phi_c) if flat else phi_c
     found = press_sections(
-        scene.geometry, material, s_c, at, depth[None], midline=flat,
-        half_width=scene.plan.options.half_width,
+        scene.geometry, material, s_c, at, depth[None],
+        options=SectionOptions(flat, scene.plan.options.half_width),
     )  # fmt: skip
     status = jnp.where(on, found.status[0], PressStatus.BEHIND_GAP)
     normal = local_frame(at)[0]

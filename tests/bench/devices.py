@@ -37,7 +37,7 @@ from jaxtrachea.fitting.settings import Settings  # noqa: E402
 from jaxtrachea.fitting.study import build_study, default_parameters  # noqa: E402
 from jaxtrachea.measurements.read import Curve  # noqa: E402
 from jaxtrachea.mechanics.sections.material import from_wall  # noqa: E402
-from jaxtrachea.mechanics.sections.press import press_sections  # noqa: E402
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections  # noqa: E402
 from jaxtrachea.trachea.tube import make_tube  # noqa: E402
 
 FITTED = {"EI_L": 1887.0, "k_M": 0.214, "k_1": 6.83, "k_3": 0.01, "GA_L": 7.16}
@@ -82,7 +82,11 @@ def cases(dtype: str):
     wall, path = from_wall(geometry), numbers(np.linspace(0.75, 6, 8))
 
     def sections(phi):
-        return lambda s: press_sections(geometry, wall, s, phi, path, midline=phi == 0).force
+        return lambda s: (
+            press_sections(
+                geometry, wall, s, phi, path, options=SectionOptions(midline=phi == 0)
+            ).force
+        )
 
     tool = box(numbers([2.0, 1.5, 4.0]), numbers(0.3))
     tube = straight_patches(BORDERS, 12.0, dtype=dtype)

@@ -27,7 +27,7 @@ from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.material import Material
@@ -69,7 +69,9 @@ def calls() -> dict[str, Any]:
     for name, phi in SECTIONS.items():
 
         def section(s, D, phi=phi):
-            return press_sections(geometry, wall, s, phi, D, midline=phi == 0).force
+            return press_sections(
+                geometry, wall, s, phi, D, options=SectionOptions(midline=phi == 0)
+            ).force
 
         call, lanes = jax.jit(section), jax.jit(jax.vmap(section, (0, None)))
         cases[name] = lambda f=call: jax.block_until_ready(f(jnp.asarray(74.0), path))
@@ -117,7 +119,14 @@ def section_study(phi: float, specimens: int):
     @functools.partial(jax.vmap, in_axes=(None, 0))
     def force(values, s):
         material = SectionMaterial(**(wall | dict(zip(names, values, strict=True))))
-        got = press_sections(SHORT, material, s, phi, jnp.asarray(SHORT_PATH), midline=phi == 0)
+        got = press_sections(
+            SHORT,
+            material,
+            s,
+            phi,
+            jnp.asarray(SHORT_PATH),
+            options=SectionOptions(midline=phi == 0),
+        )
         return -jnp.cos(phi) * got.force[:, 1] - jnp.sin(phi) * got.force[:, 2]
 
     clean = np.asarray(force(jnp.asarray(truth), jnp.asarray(places)))

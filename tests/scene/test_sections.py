@@ -23,7 +23,7 @@ from jaxtrachea import (
 from jaxtrachea._errors import InputError
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.sections.material import from_wall
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.build import ends_not_given, material_of, stage
 from jaxtrachea.scene.declare import SECTIONS, SceneFacts
@@ -159,7 +159,9 @@ def test_a_tool_presses_as_presses_do():
     assert out.status.tolist() == [PressStatus.NO_CONTACT, OK, OK, OK]
     depth = -np.asarray(out.displacement[:, 1])
     assert float(out.s[0]) == pytest.approx(75.0, abs=0.01)
-    one = jax.jit(lambda s: press_sections(TUBE, WALL, s, 0.0, depth, midline=True))(out.s[0])
+    one = jax.jit(
+        lambda s: press_sections(TUBE, WALL, s, 0.0, depth, options=SectionOptions(midline=True))
+    )(out.s[0])
     np.testing.assert_allclose(out.force, one.force, atol=1e-9)
     np.testing.assert_allclose(out.end_U, one.end_U, atol=1e-9)
     with pytest.raises(ValueError, match="session has no skeleton 'sections'"):

@@ -15,7 +15,7 @@ from jaxtrachea.mechanics.sections import press as press_module
 from jaxtrachea.mechanics.sections import system
 from jaxtrachea.mechanics.sections.contact import place_on
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
-from jaxtrachea.mechanics.sections.press import build, press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, build, press_sections
 from jaxtrachea.mechanics.sections.solve import _flat as flat
 from jaxtrachea.mechanics.sections.solve import _newton as newton_step
 from jaxtrachea.mechanics.sections.solve import _size as size_of_step
@@ -46,7 +46,9 @@ def program(midline=False, dtype="float64"):
 
     def one(values, s_c, phi_c, path):
         material = SectionMaterial(**values)
-        return press_sections(geometry, material, s_c, phi_c, path, midline=midline)
+        return press_sections(
+            geometry, material, s_c, phi_c, path, options=SectionOptions(midline=midline)
+        )
 
     return jax.jit(jax.vmap(one))
 

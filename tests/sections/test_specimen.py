@@ -14,7 +14,7 @@ import pytest
 
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.sections.material import Factors, Wall, from_wall, neutral_radius
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -60,7 +60,9 @@ def test_finite_strain_on_the_midline():
     D, force, markers = (np.array([getattr(curve, k)[1:] for curve in curves]) for k in keys)
 
     def one(s, path):
-        return press_sections(GEOMETRY, from_wall(GEOMETRY), s, 0.0, path, midline=True)
+        return press_sections(
+            GEOMETRY, from_wall(GEOMETRY), s, 0.0, path, options=SectionOptions(midline=True)
+        )
 
     got = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(jnp.asarray(s_c), jnp.asarray(D)))
     assert np.all(got.status == PressStatus.OK)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -33,7 +33,7 @@ def pressed():
     def one(s_c, phi_c):
         edges = jnp.stack([s_c - HALF, s_c + HALF])
         asked = TUBE, SectionMaterial(**VALUES), s_c, phi_c, PATH
-        return press_sections(*asked, places=edges, half_width=HALF)
+        return press_sections(*asked, places=edges, options=SectionOptions(half_width=HALF))
 
     got = jax.jit(jax.vmap(one), compiler_options=QUICK)(PLACES, ANGLES)
     return jax.tree.map(np.asarray, got)
@@ -46,7 +46,14 @@ def test_statuses():
     assert np.isnan(pressed().force[5:]).all()
     assert np.isfinite(pressed().force[:5]).all()
     with pytest.raises(ValueError, match="half_width is -1 mm; expected 0 or more"):
-        press_sections(TUBE, SectionMaterial(**VALUES), 25.0, 0.0, PATH, half_width=-1.0)
+        press_sections(
+            TUBE,
+            SectionMaterial(**VALUES),
+            25.0,
+            0.0,
+            PATH,
+            options=SectionOptions(half_width=-1.0),
+        )
 
 
 def test_work_and_mirror_image():

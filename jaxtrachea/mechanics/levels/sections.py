@@ -13,7 +13,7 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial
-from jaxtrachea.mechanics.sections.press import press_sections, tested_angle
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections, tested_angle
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS
@@ -104,10 +104,8 @@ class Sections(Level):
         along = jnp.asarray([1.0, 0.0], dtype) if motion.direction is None else motion.direction
         D = motion.displacement
         moved = D if motion.onset is None else D - motion.onset
-        pressed = press_sections(
-            tube, material, motion.s_c, phi_c, moved, along, midline=plain,
-            half_width=self.options.half_width,
-        )  # fmt: skip
+        options = SectionOptions(plain, self.options.half_width)
+        pressed = press_sections(tube, material, motion.s_c, phi_c, moved, along, options=options)
         frame = local_frame(phi_c)[::2]  # inward normal, circumference
         force, joints = pressed.force @ frame.T, pressed.joints @ frame.T
         across: Float[Array, 2] = jnp.stack([-along[1], along[0]])

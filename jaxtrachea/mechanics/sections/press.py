@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea._arguments import ArrayLike, check_record, shaped
 from jaxtrachea._numerics import epsilon, full_precision, largest
 from jaxtrachea.mechanics.admission import hide
 from jaxtrachea.mechanics.ring import on_ring
@@ -51,6 +51,30 @@ def tested_angle(half_angle: Float[Array, ""] | float) -> Float[Array, ""]:
         half_angle: of the rings, rad.
     """
     return jnp.minimum(SIDE, half_angle - END)
+
+
+@dataclasses.dataclass(frozen=True)
+class SectionOptions:
+    """What a press on deforming cross-sections includes; static, it selects the program.
+
+    Attributes:
+        midline: phi_c = 0 and a normal direction only, a quarter of the work; other presses are
+            OFF_PLAN in it.
+        half_width: of a flat punch along the tube, mm: two forces, that far before and behind s_c,
+            hold the wall level, as in `Options`. All of it has to lie on the tube, else OFF_TUBE.
+            `SectionPress.skeleton` and `depth` are means of both edges. 0: the tool is a point.
+    """
+
+    midline: bool = False
+    half_width: float = 0.0
+
+    def __post_init__(self):
+        """Refuse a width that none is.
+
+        Raises:
+            ValueError: naming the option, what was found and what is expected.
+        """
+        check_record(self, half_width=0.0)
 
 
 class SectionPress(NamedTuple):
@@ -95,9 +119,8 @@ def press_sections(
     displacement: ArrayLike,
     direction: ArrayLike = (1.0, 0.0),
     *,
-    midline: bool = False,
+    options: SectionOptions = SectionOptions(),
     places: ArrayLike | None = None,
-    half_width: float = 0.0,
 ) -> SectionPress:
     """Press or draw the tool, stuck to the surface at (s_c, phi_c), along a path from rest.
 
@@ -113,12 +136,8 @@ def press_sections(
         phi_c: contact angle from the anterior midline, rad, in [-alpha, alpha].
         displacement: of the tool after first touch, mm, in the order in which it moves; shape (n,).
         direction: displacement per unit of that, along the inward normal and the circumference.
-        midline: a program for phi_c = 0 and a normal direction only, a quarter of the work; other
-            presses are OFF_PLAN in it.
+        options: a program for the midline alone, and the width of the tool.
         places: positions along the tube, mm, where the sections' modes are wanted; None: nowhere.
-        half_width: of a flat punch along the tube, mm: two forces, that far before and behind s_c,
-            hold the wall level (static, as in `Options`). All of it has to lie on the tube, else
-            OFF_TUBE. `skeleton` and `depth` are means of both edges. 0: the tool is a point.
 
     Returns:
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
@@ -138,15 +157,13 @@ def press_sections(
     s_c = shaped("s_c", s_c, (), dtype=dtype, why="; use jax.vmap for many positions")
     if places is not None:
         places = shaped("places", places, ("any number of",), dtype=dtype)
-    if not 0 <= half_width < np.inf:
-        raise ValueError(f"half_width is {half_width:g} mm; expected 0 or more")
     arrays = s_c, phi_c, displacement, direction, places
-    return _press(geometry, material, *arrays, midline, float(half_width))
+    return _press(geometry, material, *arrays, options)
 
 
 # Inlined: the program is as without. But what calls it is traced through derivatives and maps from
 # equations that are known, in all programs for the same shapes, and not through its Python again.
-@functools.partial(jax.jit, static_argnames=("midline", "half_width"), inline=True)
+@functools.partial(jax.jit, static_argnames="options", inline=True)
 @full_precision
 def _press(
     geometry: Geometry,
@@ -156,10 +173,10 @@ def _press(
     displacement: Float[Array, " n"],
     direction: Float[Array, "2"],
     places: Float[Array, " k"] | None,
-    midline: bool,
-    half_width: float,
+    options: SectionOptions,
 ) -> SectionPress:
     """`press_sections` of arrays."""
+    midline, half_width = options.midline, options.half_width
     asked = _admit(geometry, material, s_c, phi_c, direction, midline, half_width)
     parts = build(geometry, *asked[:4], midline=midline, half_width=half_width)
     known = jnp.isfinite(displacement)

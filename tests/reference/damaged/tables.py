@@ -132,7 +132,7 @@ VALUES = {
     "sigma zero": beside(with_column("sigma [N]", 0, 0, 0, 0), "sigma is not positive"),
     "sigma negative": beside(with_column("sigma [N]", 1, -1, 1, 1), "sigma", "line 3"),
     "sigma nan": beside(with_column("sigma [N]", 1, 1, "nan", 1), "sigma", "line 4"),
-    "marker infinite": beside(with_column("joint_3 [mm]", 1, 1, "inf", 1), "joint", "line 4"),
+    "marker infinite": beside(with_column("joint_3 [mm]", 1, 1, "inf", 1), "markers", "line 4"),
     "marker on ring 0": alone(with_column("joint_0 [mm]", 1, 1, 1, 1), "joint_0", "from 1"),
     "marker on ring 16": beside(with_column("joint_16 [mm]", 0, 1, 2, 3), "ring 16 of 15"),
     "marker on ring 9999": beside(with_column("joint_9999 [mm]", 0, 1, 2, 3), "ring"),
