@@ -205,7 +205,7 @@ ROWS = {
          "step * np.arange(whole + 1)", "step * np.arange(whole)",
          "prediction/test_predict_command.py::test_a_range_ends_within_its_end"),
         ("sign-of-side-force", "measurements/vectors.py",
-         "options.force_sign * raw.side_force", "raw.side_force",
+         "options.force_sign if q.turns else 1", "1",
          "test_measured_vectors.py::test_signs"),
         ("left-out-step", "prediction/model_error.py",
          "step = half @ (half.T @", "step = -half @ (half.T @",
