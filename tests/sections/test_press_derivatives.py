@@ -35,12 +35,14 @@ def force(flat):
 
 #: Value and slope along a direction: one program for the tests below.
 ahead = jax.jit(lambda x, v: jax.jvp(force, (x,), (v,)))
-UNIT = jnp.eye(FLAT.size)
+#: All but `extrapolated`, a flag.
+USED = np.flatnonzero(np.asarray(FLAT))
+UNIT = jnp.eye(FLAT.size)[USED]
 
 
 def central_differences():
     """The value, and steps of 1e-4 of each input: an error of 1e-8 from the third derivative."""
-    h = 1e-4 * jnp.abs(FLAT)
+    h = 1e-4 * jnp.abs(FLAT[USED])
     up, down = (
         np.array([ahead(FLAT + step * v, v)[0] for step, v in zip(steps, UNIT, strict=True)])
         for steps in (h, -h)
@@ -91,14 +93,14 @@ def test_many_directions_at_once():
 def test_forward_is_central_differences():
     """Each parameter by itself."""
     value, differences = central_differences()
-    size = np.abs(value)[:, None] / np.abs(FLAT)[None]
+    size = np.abs(value)[:, None] / np.abs(FLAT[USED])[None]
     np.testing.assert_allclose(forward() / size, differences / size, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow
 def test_reverse_is_forward():
     back = jax.jit(lambda x, w: jax.vjp(force, x)[1](w)[0])  # of one result
-    reverse = np.stack([back(FLAT, w) for w in jnp.eye(3)])
+    reverse = np.stack([back(FLAT, w)[USED] for w in jnp.eye(3)])
     np.testing.assert_allclose(reverse, forward(), atol=1e-9 * np.abs(forward()).max())
 
 
