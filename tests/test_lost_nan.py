@@ -4,7 +4,6 @@ Rows and lanes count together; one that comes last is kept. A NaN that was
 computed (0 / 0) has another sign than `jnp.nan`.
 """
 
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -81,13 +80,20 @@ def test_a_press_by_what_is_no_number():
     np.testing.assert_array_equal(found.status[~bad], PressStatus.NO_CONTACT)
 
 
+class _Shape(NamedTuple):
+    radius: jax.Array
+
+
+class _Place(NamedTuple):
+    own: np.ndarray
+
+
 def test_newtons_method_on_sections_accepts_no_state_that_is_no_number(monkeypatch):
     """512 lanes of 12 unknowns, of which the sixth is NaN after a step (in every other lane)."""
     lanes, unknowns, rest = 512, 12, jnp.zeros(())
     parts = dict.fromkeys(System._fields) | {
         "scale": np.zeros((1, 1, 8)), "give": np.zeros(2),
-        "shape": SimpleNamespace(radius=jnp.asarray(10.0)),
-        "place": SimpleNamespace(own=np.zeros((1, 2))),
+        "shape": _Shape(radius=jnp.asarray(10.0)), "place": _Place(own=np.zeros((1, 2))),
     }  # fmt: skip
     system = System(**parts)  # pyright: ignore
 

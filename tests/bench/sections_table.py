@@ -3,8 +3,8 @@
     python tests/bench/sections_table.py
 
 prints a row a case: normal force at small strain, largest error over the peak, largest error of
-side over normal force, and the worst status. The table of docs/off_midline.md is of these rows.
-Some minutes, most of them compilation.
+side over normal force, and the worst status. The table of docs/evidence/off_midline.md is of these
+rows. Some minutes, most of them compilation.
 """
 
 import os
