@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtrachea.measurements.curve import Fault, ReadOptions
-from jaxtrachea.measurements.observed import OBSERVED
+from jaxtrachea.measurements.observed import OBSERVED, RING_NUMBERS, RINGS
 from jaxtrachea.measurements.readers import READERS
 from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS, load
 from jaxtrachea.measurements.readers.column_roles import find_roles, time_column
@@ -22,8 +22,8 @@ from jaxtrachea.measurements.readers.workbook import read_sheets
 HEAD_BYTES = 2**18
 #: Roles of datasets by their names in the project's own HDF5 files, where they differ.
 _STORED = {
-    "s_c": "s", "phi_c": "phi", "joint_ring_number": "joint", "end_ring_number": "end",
-    **{q.name: q.role for q in OBSERVED},
+    "s_c": "s", "phi_c": "phi", **{q.name: q.role for q in OBSERVED},
+    **{RING_NUMBERS[field]: of_rings[0].role for field, of_rings in RINGS.items()},
 }  # fmt: skip
 _OF_AFM = {"force": "force", "height (measured)": "displacement", "tip position": "displacement",
            "segment": "segment"}  # fmt: skip

@@ -95,6 +95,8 @@ RINGS = {
     field: tuple(q for q in OBSERVED if q.rings == field)
     for field in dict.fromkeys(q.rings for q in OBSERVED if q.rings is not None)
 }
+#: Datasets and messages number rings from 1, under names of their own.
+RING_NUMBERS = {"joint_rings": "joint_ring_number", "end_rings": "end_ring_number"}
 #: Fields of a curve that one of displacement, force, noise and time does not have.
 FURTHER_FIELDS = (*(q.name for q in OBSERVED if q.gaps), *RINGS)
 #: Fields that a model of presses along the normal does not read, and changes that take them off.

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from jaxtrachea.measurements.curve import Curve, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.observed import OBSERVED, RINGS, VECTORS, Quantity
+from jaxtrachea.measurements.observed import OBSERVED, RING_NUMBERS, RINGS, VECTORS, Quantity
 
 #: A direction whose length differs from 1 by less is taken, and made of length 1.
 UNIT_LENGTH = 1e-3
@@ -54,7 +54,7 @@ def check_vector_shapes(raw: RawCurve) -> None:
 def _check_rings(raw: RawCurve, field: str, given: Sequence[Quantity]) -> None:
     """Refuse ring numbers without what they number, and the reverse."""
     rings, names = getattr(raw, field), " and ".join(q.name for q in given)
-    number = field.replace("_rings", "_ring_number")
+    number = RING_NUMBERS[field]
     if rings is None and given:
         raise Fault("shape", f"{names} without {number}", "number the rings, from 1")
     if rings is None:

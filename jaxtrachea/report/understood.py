@@ -69,7 +69,7 @@ def foreign_factors(spec: FitSpec, study: Study) -> list[str]:
     whose = "[wall]" if spec.wall is not None else "the wall of the virtual specimen (no [wall])"
     return [
         f"Warning: {', '.join(taken)} stay fixed at what {whose} and the factors of another "
-        f"specimen give ({why}): presses unlike those fitted may be up to 20 % off; free them, or "
+        f"specimen give ({why}): presses unlike those fitted may be up to 30 % off; free them, or "
         "fix numbers of this tube"
     ]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, DataError, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.observed import OBSERVED, RINGS
+from jaxtrachea.measurements.observed import OBSERVED, RING_NUMBERS, RINGS
 from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import (
     attribute,
@@ -38,7 +38,7 @@ LIMITS = Limits(
     texts=("/curves/specimen", "/curves/trial", "/curves/source"),
 )
 #: Fields of a curve that are called otherwise in the file.
-FIELDS = {"joint_ring_number": "joint_rings", "end_ring_number": "end_rings"}
+FIELDS = {number: field for field, number in RING_NUMBERS.items()}
 #: Quantities: role of the unit (None: ring numbers) and the unit that is written.
 QUANTITIES: dict[str, tuple[str | None, str | None]] = {
     "displacement": ("displacement", "mm"),
