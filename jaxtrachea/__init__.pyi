@@ -1,6 +1,5 @@
 """The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
 
-from ._in_order import one_kernel as one_kernel
 from .fitting.fit import fit as fit
 from .fitting.lanes import Noise as Noise
 from .fitting.lanes import Weighting as Weighting
@@ -8,6 +7,7 @@ from .fitting.result import FitResult as FitResult
 from .fitting.settings import Settings as Settings
 from .fitting.study import Study as Study
 from .fitting.study import build_study as build_study
+from .fusion import fuse as fuse
 from .inference.bootstrap import bootstrap as bootstrap
 from .inference.profile import profiles as profiles
 from .measurements.curve import Curve as Curve

@@ -65,7 +65,7 @@ def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array
     """The product of small matrices (or of a matrix and a vector), written out.
 
     XLA for CPUs calls a library for `a @ b`: that takes longer than these few operations, and what
-    is one kernel cannot do it (`_in_order.one_kernel`).
+    is one kernel cannot do it (`fusion.fuse`).
 
     Args:
         a: of shape (..., k), k small.
@@ -130,7 +130,7 @@ def picked(values: Float[Array, "*rows n"], index: Int[Array, "*places"]) -> Flo
     """`values[..., index]`, as a sum of choices; 0 where there is no such place.
 
     Going back that is a choice again; of `values[index]` it is a scatter, which no single kernel
-    can do (`_in_order.one_kernel`).
+    can do (`fusion.fuse`).
     """
     rows, n = values.shape[:-1], values.shape[-1]
     each = values.reshape(*rows, *[1] * index.ndim, n)
@@ -164,7 +164,7 @@ def _greatest(x):
 
     XLA for CPUs gives a maximum or minimum of 4,096 entries and more, those of all rows and lanes
     together, to a library that drops a NaN (jaxlib 0.10.2). A comparison it keeps to itself, but
-    puts into no single kernel (`_in_order.one_kernel`): so lanes are told of (`custom_vmap`).
+    puts into no single kernel (`fusion.fuse`): so lanes are told of (`custom_vmap`).
     """
     return _greatest_in_lanes(x)
 
@@ -228,7 +228,7 @@ def lowest(x: Float[Array, " n"], count: int) -> tuple[Int[Array, " count"], Boo
     """Indices of the lowest entries, rising, and which entries are left.
 
     A few are found one by one: `jax.lax.top_k` is a kernel of its own, which takes longer and
-    cannot be part of another (`_in_order.one_kernel`). Not by `first_largest`, which may miss.
+    cannot be part of another (`fusion.fuse`). Not by `first_largest`, which may miss.
 
     Args:
         x: no NaN, and at least `count` entries below infinity: else an index may come twice.

@@ -1,7 +1,7 @@
 """A traced function with its products of matrices written out as sums.
 
 XLA for CPUs hands `a @ b` to a library. For a few small matrices in a single call that takes longer
-than the sum written out, and what is one kernel cannot do it (`_in_order.one_kernel`); for many
+than the sum written out, and what is one kernel cannot do it (`fusion.fuse`); for many
 lanes the library is quicker. So a part is written with `@`, and this turns it into sums where it is
 called alone.
 """

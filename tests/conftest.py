@@ -144,7 +144,7 @@ LONGEST = (
 )
 #: The same for the slow tests, both halves.
 LONGEST_SLOW = (
-    "test_scrutiny.py",
+    "test_verify.py",
     "test_full_disk.py",
     "test_processes.py",
     "test_resume.py",

@@ -152,8 +152,8 @@ ROWS = {
          "moved = share * chord - gap * inward", "moved = share * chord",
          "scene/test_session.py::test_a_jump_grasps_anew "
          "scene/test_session.py::test_a_seat_follows_the_tool"),
-        ("seat-apart", "scene/seat.py",
-         "_limit(APART * depth, jnp.abs(off[0]))", "_limit(APART * depth, off[0])",
+        ("seat-apart", "scene/anchor.py",
+         "_limit(MAX_MISMATCH * depth, jnp.abs(off[0]))", "_limit(MAX_MISMATCH * depth, off[0])",
          "scene/test_session.py::test_what_gives_way_only_loses_energy"),
         ("moment-of-a-pose", "scene/configurational.py",
          "jnp.cross(path.rotation, poses.rotation, axis=1)",

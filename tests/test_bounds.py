@@ -176,7 +176,7 @@ def test_joint_fits_with_bounds(seeds):
     for seed in seeds:
         study = joint_study(seed)
         joint, dense = study(joint=True), study()
-        result = fit(joint, Settings(starts=1, more_starts=0, scrutiny=False))
+        result = fit(joint, Settings(starts=1, more_starts=0, verify=False))
         assert np.all(result.status <= FitStatus.AT_BOUND)
         theta = bounded.dense_theta(joint, dense, result.theta)
         known = np.ones((1, 2))
@@ -189,7 +189,7 @@ def test_joint_fits_with_bounds(seeds):
 @pytest.fixture(scope="module")
 def fitted():
     study, start = bounded.random_study(5, 40)
-    result = fit(study, Settings(starts=1, more_starts=0, scrutiny=False), starts=start)
+    result = fit(study, Settings(starts=1, more_starts=0, verify=False), starts=start)
     assert np.all(result.succeeded)
     return result
 
@@ -201,7 +201,7 @@ def test_profiles_with_bounds(fitted):
     cornered = fitted.at_bound.all(axis=1)
     assert cornered.any()
     assert np.all(fitted.status[cornered] == FitStatus.AT_BOUND)
-    curves = profiles(fitted, Settings(starts=1, scrutiny=False), points=2)
+    curves = profiles(fitted, Settings(starts=1, verify=False), points=2)
     good = np.isfinite(curves.statistic)
     assert np.mean(good) > 0.99
     assert np.mean(curves.end == ProfileEnd.FAILED) < 0.01
@@ -227,7 +227,7 @@ def test_bootstrap_with_bounds(fitted, monkeypatch):
         return result
 
     monkeypatch.setattr(bootstraps, "fit", recorded)
-    bootstraps.bootstrap(fitted, Settings(starts=1, scrutiny=False), count=bootstraps.FEWEST)
+    bootstraps.bootstrap(fitted, Settings(starts=1, verify=False), count=bootstraps.FEWEST)
     study, result = seen[0]
     assert np.mean(result.succeeded) > 0.99
     rows = np.flatnonzero(result.succeeded)

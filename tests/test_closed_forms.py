@@ -35,7 +35,7 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(
-    starts=1, scrutiny=False, tolerances=Tolerances(cost=1e-15, gradient=1e-12, step=1e-12)
+    starts=1, verify=False, tolerances=Tolerances(cost=1e-15, gradient=1e-12, step=1e-12)
 )
 D = np.linspace(0.1, 2, 12)
 FORCE = 1.3 * D + np.random.default_rng(4).standard_t(2, size=12) * 0.1

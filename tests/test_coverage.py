@@ -27,7 +27,7 @@ def covered(level, count):
     noise = np.random.default_rng(4).normal(size=force.shape)
     force = force + level * np.abs(force).max((1, 2), keepdims=True) * noise
     changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
-    one = Settings(starts=1, scrutiny=False)  # no one reads verdicts
+    one = Settings(starts=1, verify=False)  # no one reads verdicts
     result = fit(synthetic.study(force, changes=changes), one)
     found = profiles(result, one, points=2)
     lanes = found.lane[::4]

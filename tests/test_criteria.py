@@ -293,7 +293,7 @@ def test_refits_end_in_the_minimum_of_the_whole_fit():
     curves, noise = pressed_by_elements()
     study, one = build_study(curves, table_1()), Settings(starts=1)
     whole = fit(study, one)
-    alone = fit(without(study, np.arange(6)[None] == 0), dataclasses.replace(one, scrutiny=False))
+    alone = fit(without(study, np.arange(6)[None] == 0), dataclasses.replace(one, verify=False))
     assert alone.value[0, 2] > 1e4
     assert alone.rms[0, 0] > 10 * whole.rms[0, 0]
     left = leave_one_out(whole, one)

@@ -33,7 +33,7 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.status import FitStatus
 
 #: No one reads verdicts here.
-ONE = Settings(starts=1, scrutiny=False)
+ONE = Settings(starts=1, verify=False)
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 BEFORE = np.array([22.0, 75.0, 80.0])
 SIGMA = 0.05

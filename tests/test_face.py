@@ -118,7 +118,7 @@ def test_dataset_takes_profiles_as_the_table_does():
         for p in parameters()
     ]
     noisy = curves(force + 1e-3 * force.max() * noise)
-    plain = dataclasses.replace(SETTINGS, scrutiny=False)
+    plain = dataclasses.replace(SETTINGS, verify=False)
     result = jt.fit(jt.build_study(noisy, GEOMETRY, OPTIONS, table), plain)
     profiles = jt.profiles(result, SETTINGS, ["k_M"], points=2)
     for given in (None, profiles):
@@ -206,7 +206,7 @@ def test_profiles_and_bootstrap_go_by_the_same_names():
 def test_a_fit_in_single_precision_is_said_once():
     """With the cure, at the user's line; not where float32 was asked for, nor in float64."""
     study = jt.build_study(curves(forces(TRUTH[:1])[0]), GEOMETRY, OPTIONS, parameters())
-    plain = jt.Settings(starts=1, more_starts=0, scrutiny=False)
+    plain = jt.Settings(starts=1, more_starts=0, verify=False)
 
     def warned(call):
         how._warn_of_single_precision.cache_clear()

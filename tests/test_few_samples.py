@@ -102,7 +102,7 @@ def test_given_starts_are_of_all_samples(study, seen):
 @pytest.mark.parametrize(
     ("changes", "more"),
     [
-        ({"scrutiny": False}, {}),
+        ({"verify": False}, {}),
         ({"float32": True}, {}),
         ({"method": "lbfgs"}, {}),
         ({"starts": 3}, {}),  # sixty in all

@@ -24,7 +24,7 @@ from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.material import Material
 
 #: No one reads verdicts here.
-ONE = Settings(starts=1, scrutiny=False)
+ONE = Settings(starts=1, verify=False)
 #: Truths that four curves with 1 % noise identify: a soft contact that hardens early.
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 

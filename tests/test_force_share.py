@@ -9,7 +9,7 @@ from jaxtrachea.fitting.evaluate import evaluated
 from jaxtrachea.fitting.force_share import Levels, _most_likely, changed, with_levels
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.results.arrays import arrays_of, result_of
@@ -97,7 +97,7 @@ def test_a_share_that_was_found_is_kept_with_the_fit(tmp_path):
     plain = study(Noise(), parameters={n: held["k_1"] for n in ("k_1", "k_3", "EI_L", "k_M")})
     weighed = with_levels(plain, Levels(np.array([0.02]), np.array([0.05])), plain.lanes.force)
     result = evaluated(weighed)
-    write_hdf5(tmp_path / "results.h5", Findings(result), {})
+    write_hdf5(tmp_path / "results.h5", AnalysisResults(result), {})
     for back in (result_of(plain, arrays_of(result)), read_results(tmp_path)):
         assert back.force_share.tolist() == [0.05]
         np.testing.assert_array_equal(back.study.lanes.precision, weighed.lanes.precision)

@@ -21,8 +21,8 @@ from jaxtrachea import (
     simulate,
     table_1,
 )
-from jaxtrachea._in_order import in_order, in_turn, one_kernel
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.fusion import fuse, in_order, map_sequentially
 from jaxtrachea.trachea.tube import make_tube
 
 DTYPES = ["float32", "float64"]
@@ -79,7 +79,7 @@ def test_it_is_the_part(dtype, way, large, monkeypatch):
     do = WAYS[way]
     x, a, xs, As = numbers(dtype, (2,), (3,), (LANES, 2), (4, 3))
     both = jnp.stack([a] * LANES)
-    marks = in_turn(wave), in_turn(one_kernel(wave))
+    marks = map_sequentially(wave), map_sequentially(fuse(wave))
     for axes, at in {
         None: (x, a),
         (0, None): (xs, a),
@@ -107,8 +107,8 @@ def test_the_derivative_by_hand():
     x, a = numbers("float64", (LANES, 1), (LANES, 1))
     sine = np.sin(np.asarray(x) * np.linspace(0, 1, POINTS)[None])
     expected = 4 * np.asarray(a) ** 3 * np.mean(sine**2, axis=1, keepdims=True)
-    each = jax.vmap(jax.grad(total(in_turn(wave)), argnums=1))
-    whole = jax.grad(lambda a: jnp.sum(jax.vmap(total(in_turn(wave)))(x, a)))
+    each = jax.vmap(jax.grad(total(map_sequentially(wave)), argnums=1))
+    whole = jax.grad(lambda a: jnp.sum(jax.vmap(total(map_sequentially(wave)))(x, a)))
     for found in (jax.jit(each)(x, a), jax.jit(whole)(a)):
         np.testing.assert_allclose(found, expected, rtol=1e-13)
 
@@ -122,7 +122,7 @@ def test_large_lanes_are_in_a_loop_on_a_cpu(dtype, mode):
     """The largest of many running sums, which are no result: only what is marked has a loop."""
     xs, As = numbers(dtype, (LANES, 2), (LANES, 3))
     found = {}
-    for points, mark in itertools.product((POINTS, 3), (in_turn, lambda f: f)):
+    for points, mark in itertools.product((POINTS, 3), (map_sequentially, lambda f: f)):
 
         def part(x, a, points=points):
             along = jnp.linspace(0, 1, points, dtype=x.dtype)
@@ -135,14 +135,14 @@ def test_large_lanes_are_in_a_loop_on_a_cpu(dtype, mode):
 
         text = mode(jax.vmap(loss)).lower(xs, As).compile().as_text()
         loops = re.findall(r" while\(.*known_trip_count.*\"n\":\"" + str(LANES), text)
-        found[points, mark is in_turn] = bool(loops)
+        found[points, mark is map_sequentially] = bool(loops)
     assert found == {(POINTS, True): True, (POINTS, False): False, (3, True): False,
                      (3, False): False}  # fmt: skip
 
 
 def test_other_devices_take_all_lanes_together():
     xs, As = numbers("float64", (LANES, 2), (LANES, 3))
-    f = jax.jit(jax.vmap(total(in_turn(wave))))
+    f = jax.jit(jax.vmap(total(map_sequentially(wave))))
     texts = [
         jax.export.export(f, platforms=(device,))(xs, As).mlir_module()
         for device in ("cuda", "cpu")
@@ -150,7 +150,7 @@ def test_other_devices_take_all_lanes_together():
     assert ["stablehlo.while" in t for t in texts] == [False, True]
 
 
-@pytest.mark.parametrize("mark", [in_order, one_kernel, in_turn])
+@pytest.mark.parametrize("mark", [in_order, fuse, map_sequentially])
 def test_what_is_not_read_is_not_computed(mark):
     """Of two results of a call, where a marked part reads one."""
     x = jnp.linspace(0, 1, 7)

@@ -21,7 +21,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.geometry import table_1
 
-SHARP = Settings(starts=1, scrutiny=False, tolerances=Tolerances(1e-15, 1e-15, 1e-15, 100))
+SHARP = Settings(starts=1, verify=False, tolerances=Tolerances(1e-15, 1e-15, 1e-15, 100))
 
 
 def linear_study(lengths, balance="curve", **noise):

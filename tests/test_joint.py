@@ -21,7 +21,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference.analyses.population import POPULATION, population_rows
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.bootstrap import bootstrap
 from jaxtrachea.inference.cross_validation import curves_to_leave_out
 from jaxtrachea.inference.design.candidates import check
@@ -232,7 +232,7 @@ def test_bounds_of_shared_and_of_own_unknowns():
 
 
 def test_rows_name_what_is_shared_once(linear):
-    rows = list(parameter_rows(Findings(linear, ((POPULATION, population(linear)),))))
+    rows = list(parameter_rows(AnalysisResults(linear, ((POPULATION, population(linear)),))))
     shared = [r for r in rows if r["parameter"] == "k_3"]
     assert [r["specimen"] for r in shared] == ["(all)"]
     own = [r for r in rows if r["parameter"] == "k_1"]

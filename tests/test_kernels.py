@@ -16,7 +16,7 @@ from importlib.metadata import version
 import pytest
 from kernels import ONE, computations, count_kernels
 
-from jaxtrachea._in_order import TESTED
+from jaxtrachea.fusion import SUPPORTED_JAXLIB
 
 #: Kernels of a single contact, value and with gradient, jaxlib 0.10.2: of a ball on the round tube,
 #: of a box on patches of 120 corners. Before sums were written out: 697, 716, 1,030 and 1,048. The
@@ -130,7 +130,7 @@ def test_the_whole_update_of_one_pose():
     # factors. All but where the dent reaches have derivatives.
     assert len(called) == 9
     assert len(back) == 9 + 8
-    if version("jaxlib") in TESTED:
+    if version("jaxlib") in SUPPORTED_JAXLIB:
         assert sum(ONE in v for v in called) == 7
         # Of the same programs without one kernel for a part: 1,163, and with the gradient 1,834.
         assert count_kernels(value, inside=False)[0] <= MARGIN * 45
@@ -162,7 +162,7 @@ def test_a_step_of_a_session_is_one_kernel_but_for_the_surface():
     )
     assert run.returncode == 0, run.stderr
     text = json.loads(run.stdout)
-    if version("jaxlib") in TESTED:
+    if version("jaxlib") in SUPPORTED_JAXLIB:
         assert count_kernels(text, inside=False)[0] <= MARGIN * 28
 
 

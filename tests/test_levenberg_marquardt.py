@@ -91,14 +91,14 @@ BOXES = [
 @pytest.mark.parametrize(
     ("count", "batch", "quick"), [(1, 16, False), (1, 16, True), (1000, 64, False)]
 )
-def test_minima_of_a_valley_inside_boxes(count, batch, quick):
+def test_minima_of_a_valley_inside_boxes(count, batch, unoptimised):
     """From `count` starts of each box, in batches with a rest: all end where the algebra says."""
     valley = Valley(*(np.array(column) for column in list(zip(*BOXES, strict=True))[:3]))
     rows = np.tile(np.arange(4), count)
     unit = np.random.default_rng(1).uniform(size=(4 * count, 2))
     starts = valley.lower[rows] + unit * (valley.upper - valley.lower)[rows]
     starts[rows == 3, 1] = 3.0
-    solved = levenberg_marquardt(valley, starts, rows, batch=batch, quick=quick)
+    solved = levenberg_marquardt(valley, starts, rows, batch=batch, unoptimised=unoptimised)
     minimum = np.array([m for *_, m in BOXES])[rows]
     assert np.all(solved.status == FitStatus.CONVERGED)
     # A relative fall of the cost by 1e-10 is left; with a residual of 1 a distance of its root.

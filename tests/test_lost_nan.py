@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from late import late
 
-from jaxtrachea._in_order import fits_one_kernel, one_kernel
 from jaxtrachea._numerics import largest
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.fitting import descent
+from jaxtrachea.fusion import fits_one_kernel, fuse
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.sections import solve
 from jaxtrachea.mechanics.sections.system import System
@@ -52,7 +52,7 @@ def test_the_largest_of_many_is_no_number(shape, dtype):
 def test_the_largest_in_one_kernel(lanes):
     """Alone it is part of the kernel, and lanes of it, taken twice, keep a NaN as well."""
     x = np.random.default_rng(2).normal(size=(lanes, 3, 20))
-    found = jax.jit(jax.vmap(jax.vmap(one_kernel(lambda x: largest(2 * x)))))
+    found = jax.jit(jax.vmap(jax.vmap(fuse(lambda x: largest(2 * x)))))
     np.testing.assert_array_equal(found(x), 2 * x.max(axis=-1))
     x[lanes // 2, 1, 4] = np.nan
     np.testing.assert_array_equal(found(x), 2 * x.max(axis=-1))

@@ -14,7 +14,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
 
 SIGMA, D = 0.003, np.linspace(0.1, 2, 60)
-QUICK = Settings(starts=1, scrutiny=False)
+QUICK = Settings(starts=1, verify=False)
 
 
 def lines(count, seed=0):

@@ -16,7 +16,7 @@ from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.prediction.predict import predict
 
-QUICK = Settings(starts=1, scrutiny=False)
+QUICK = Settings(starts=1, verify=False)
 TRUTH = np.array([[100.0, 1.0, 1.0, 0.01]])
 FORCE, MARKER = 0.02, 0.005
 RINGS = np.arange(15)

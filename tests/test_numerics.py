@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from late import late
 
-from jaxtrachea._in_order import fits_one_kernel
 from jaxtrachea._numerics import (
     cos_sin,
     epsilon,
@@ -25,6 +24,7 @@ from jaxtrachea._numerics import (
     total,
     turned,
 )
+from jaxtrachea.fusion import fits_one_kernel
 
 DTYPES = ["float64", *late("float32")]
 

@@ -17,7 +17,7 @@ from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out, without
 from jaxtrachea.inference.design.candidates import Candidates, check
 from jaxtrachea.inference.design.choice import gains
@@ -35,7 +35,7 @@ from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.read import read_results
 from jaxtrachea.trachea.material import Material
 
-ONE = Settings(starts=1, scrutiny=False)
+ONE = Settings(starts=1, verify=False)
 OWN = {"onset": {"fixed": False}, "force_offset": {"fixed": False}}
 
 
@@ -353,7 +353,7 @@ def test_where_no_onset_is_fitted_nothing_changes():
 @pytest.mark.compiling
 def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path):
     """Used curves come back to 1e-9 N; a press ten times as deep, in other steps: SciPy."""
-    write_hdf5(tmp_path / "results.h5", Findings(owned), {})
+    write_hdf5(tmp_path / "results.h5", AnalysisResults(owned), {})
     read = read_results(tmp_path)
     (k_1, k_3), D = owned.value[0, :2], np.linspace(0, 50, 80)
     force = k_1 * np.maximum(D - 4, 0) + k_3 * np.maximum(D - 4, 0) ** 3 + 0.2

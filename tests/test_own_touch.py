@@ -18,7 +18,7 @@ from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.pressed import pressed
-from jaxtrachea.prediction.sources import Source
+from jaxtrachea.prediction.sources import CurveParameters
 from jaxtrachea.results.read import NoResults, read_again
 from jaxtrachea.status import FitStatus, PredictionStatus
 
@@ -132,7 +132,7 @@ def test_own_parameters_follow_those_that_are_kept():
     root = rng.normal(size=(2, 2))
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = root @ root.T
-    blank = Source(
+    blank = CurveParameters(
         "T1", "", 0, np.zeros(3), np.zeros(3), covariance, np.zeros((1, 3)), np.array(1.96),
         np.ones(2), (2,), PredictionStatus.OK, "",
     )  # fmt: skip

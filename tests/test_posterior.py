@@ -20,7 +20,7 @@ from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analyses.posterior import POSTERIOR, posterior_table
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.estimate import lane_of
 from jaxtrachea.inference.posterior import Posterior, log_density, posterior
 from jaxtrachea.inference.posterior_start import around_the_fit, mode
@@ -31,7 +31,7 @@ from jaxtrachea.report.overview import overview
 from jaxtrachea.results.rows import parameter_rows
 from jaxtrachea.trachea.geometry import table_1
 
-ONE = Settings(starts=1, scrutiny=False)
+ONE = Settings(starts=1, verify=False)
 SPEC = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n[uncertainty]\nposterior = 100\n'
 
 
@@ -229,7 +229,7 @@ def test_chains_start_at_the_mode_of_the_posterior():
 def test_poor_chains_are_said_beside_the_estimates():
     """No interval in report and table, a sentence under the estimates, empty cells, exit code 1."""
     drawn = made(1.55, 8.0, 0)
-    found = Findings(drawn.result, ((POSTERIOR, drawn),))
+    found = AnalysisResults(drawn.result, ((POSTERIOR, drawn),))
     text = report_text("T", found, [])
     estimates = text.partition("## Estimates")[2].partition("## What")[0]
     assert "The posterior of 1 of 1 fits is not to be trusted" in estimates
@@ -242,7 +242,7 @@ def test_poor_chains_are_said_beside_the_estimates():
     said = [item for item in overview(found) if isinstance(item, str)]
     assert any("not to be trusted" in text for text in said)
     assert poor(found)
-    assert not poor(Findings(drawn.result, ((POSTERIOR, made(1.0, 900.0, 0)),)))
+    assert not poor(AnalysisResults(drawn.result, ((POSTERIOR, made(1.0, 900.0, 0)),)))
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import Ladder
 from jaxtrachea.tradeoff.levels import BUILT_IN, cast, full_scene, program
 from jaxtrachea.tradeoff.load import QUIET, Load, doubt
-from jaxtrachea.tradeoff.price import GRAIN, Cost, operations, words
+from jaxtrachea.tradeoff.price import MIN_SAVING, Cost, operations, words
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -99,7 +99,7 @@ BOTH = "shear", "local"
 #: Seconds of the programs, by what is left out of them; and what is dropped then. What saves
 #: nothing but operations is not, nor what saves nothing with another.
 TIMES = [
-    ({(): 2e-3, ("shear",): 1e-3, ("local",): 2e-3 * (1 - GRAIN / 2)}, {"shear"}),
+    ({(): 2e-3, ("shear",): 1e-3, ("local",): 2e-3 * (1 - MIN_SAVING / 2)}, {"shear"}),
     ({(): 2e-3, ("shear",): 1e-3, ("local",): 1.5e-3, BOTH: 0.8e-3}, {"shear", "local"}),
     ({(): 2e-3, ("shear",): 1e-3, ("local",): 1.5e-3, BOTH: 2.1e-3}, {"shear"}),
     ({(): 2e-3, ("shear",): 2e-3, ("local",): 2.5e-3}, set()),
@@ -136,7 +136,7 @@ def test_what_saves_no_time_is_not_dropped(by, times, expected, monkeypatch):
     monkeypatch.setattr(Trial, "errors", lambda self, levels: few)
     by_time = choose(trial, 0.1, precision="float64", by=by)
     assert {rung.ladder for rung in by_time.dropped} == expected
-    assert {rung.ladder for rung in by_time.idle} == set(BOTH) - expected
+    assert {rung.ladder for rung in by_time.no_gain} == set(BOTH) - expected
     share = times[tuple(v for v in BOTH if v in expected)] / 2e-3
     assert by_time.cost == (2e-3, share, share, share)
     assert set(asked) == {by}
@@ -163,7 +163,7 @@ def test_a_finer_rung_is_taken_where_the_coarsest_saves_no_time():
     found = choosing._Found([], [], [])
     taken = choosing._within(trial, "path", ladder, 0.1, found)
     assert (taken.level, taken.saved) == ("quick", pytest.approx(0.2))
-    assert [rung.level for rung in found.idle] == ["slow"]
+    assert [rung.level for rung in found.no_gain] == ["slow"]
 
 
 def test_operations_of_a_step_are_those_of_a_row():

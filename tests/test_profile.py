@@ -19,7 +19,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.profile_search import Sides
-from jaxtrachea.fitting.result import judgement, limiting_bound
+from jaxtrachea.fitting.result import assess, limiting_bound
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.profile import profile_rows
@@ -30,7 +30,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 
-ONE = Settings(starts=1, scrutiny=False)
+ONE = Settings(starts=1, verify=False)
 PAGES = Path(__file__).parents[1] / "docs"
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 
@@ -81,7 +81,7 @@ def test_a_bound_of_the_user_within_the_interval_is_named(side, profiled):
     said = f"k_1 is limited by the {side} bound {bound:.6g} N/mm: widen it before measuring more"
     assert said in verdict_sentence(cut, 0, found)
     word = "practically non-identifiable" if profiled else "identifiable"
-    assert judgement(cut, 0, 0, found).verdict == word
+    assert assess(cut, 0, 0, found).verdict == word
     assert "limited" not in verdict_sentence(free, 0)
 
 
@@ -323,9 +323,9 @@ def test_a_bound_of_another_unknown_shortens_no_interval():
     growth, bounded = result.effective.growth, 0
     for lane, curve in enumerate(curves):
         best, _, (low, high) = constrained(np.linalg.lstsq(X, curve.force)[0], C)
-        judged = judgement(result, lane, 0, profiled)
+        assessed = assess(result, lane, 0, profiled)
         assert result.value[lane, 0] == pytest.approx(best, rel=1e-6)
-        assert judged.low == pytest.approx(best + growth[lane] * (low - best), rel=1e-5)
-        assert judged.high == pytest.approx(best + growth[lane] * (high - best), rel=1e-5)
+        assert assessed.low == pytest.approx(best + growth[lane] * (low - best), rel=1e-5)
+        assert assessed.high == pytest.approx(best + growth[lane] * (high - best), rel=1e-5)
         bounded += ProfileEnd.BOUND in profiled.end[profiled.find(lane, 0)]
     assert 5 < bounded < 24

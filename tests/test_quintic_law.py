@@ -273,7 +273,7 @@ def test_a_fit_has_it_back():
     study = build_study(curves([20.0, 45.0, 62.0, 80.0]), table_1(), Options(), SIGNED,
                         noise=Noise(force=1e-3))  # fmt: skip
     assert [p.name for p in study.free] == list(TRUTH)
-    result = fit(study, Settings(starts=6, scrutiny=False))
+    result = fit(study, Settings(starts=6, verify=False))
     np.testing.assert_allclose(result.value[0], list(TRUTH.values()), rtol=1e-5)
 
 

@@ -26,7 +26,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
-from jaxtrachea.fitting.result import judgement, unknown_label, verdict_of
+from jaxtrachea.fitting.result import assess, unknown_label, verdict_of
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import widened
@@ -36,7 +36,7 @@ from jaxtrachea.inference.analyses.influence import (
     REASONS,
     influence_cell,
 )
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import peak_force
@@ -161,10 +161,10 @@ def test_names_are_plain_text_in_pictures(name):
 @pytest.mark.compiling
 def test_a_run_of_such_names_writes_all_its_files(many, tmp_path):
     """Every picture and the page; markup and formulas as text; tables say what they leave out."""
-    paths, lost = draw_all(tmp_path, Findings(many))
+    paths, lost = draw_all(tmp_path, AnalysisResults(many))
     assert lost == {}
     assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
-    text = report_text("$x$ | <b>", Findings(many), [])
+    text = report_text("$x$ | <b>", AnalysisResults(many), [])
     made = page(text, {p.name: p.read_bytes() for p in paths}, {})
     assert "<script>" not in made
     assert "&lt;script&gt;" in made
@@ -191,10 +191,10 @@ def test_a_picture_that_fails_costs_itself(many, tmp_path, monkeypatch):
         raise ValueError("no such $ colour")
 
     monkeypatch.setattr("jaxtrachea.report.plots.draw_residuals", broken)
-    paths, lost = draw_all(tmp_path, Findings(many))
+    paths, lost = draw_all(tmp_path, AnalysisResults(many))
     assert [p.name for p in paths] == ["fit.png", "correlation.png"]
     assert lost == {"residuals.png": "ValueError: no such $ colour"}
-    text = without_lost(report_text("T", Findings(many), []), lost)
+    text = without_lost(report_text("T", AnalysisResults(many), []), lost)
     assert "](residuals.png)" not in text
     assert "residuals.png could not be drawn (ValueError: no such $ colour)" in text
     made = page(text, {p.name: p.read_bytes() for p in paths}, {})
@@ -233,7 +233,7 @@ def test_no_column_is_cut_without_an_ellipsis(width):
 
 
 def test_terminal_takes_names_as_they_are(many):
-    text = shown(overview(Findings(many)), 120)
+    text = shown(overview(AnalysisResults(many)), 120)
     for name in ("[bold]", ":smile:", "<script>", "=1+1"):
         assert name in text.split()
     assert "Worst first; and 2 more, see summary.csv" in " ".join(text.split())
@@ -263,7 +263,7 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
         assert row["k_3 [N/mm^3]"] == dense.value[0, k]
         assert row["k_3 verdict"] == verdict_of(dense, 0, k)
         assert row["k_1 [N/mm]"] == dense.value[0, 0]
-        assert row["k_1 low95"] == judgement(dense, 0, 0).low <= dense.lower[0, 0]
+        assert row["k_1 low95"] == assess(dense, 0, 0).low <= dense.lower[0, 0]
     assert rows[0]["more"] == "force_offset[A/1], force_offset[A/2]: see parameters.csv"
     assert "more" not in rows[1]
     assert "force_offset [N]" in rows[1]
@@ -288,13 +288,13 @@ def test_influence_says_why_there_is_no_number(dense):
     bound[0, 0] = True
     held = dataclasses.replace(diagnosed, result=dataclasses.replace(dense, at_bound=bound))
     assert influence_cell(held, 0, 0, 0) == "held"
-    shown_text = shown(overview(Findings(dense, ((INFLUENCE, diagnosed),))))
+    shown_text = shown(overview(AnalysisResults(dense, ((INFLUENCE, diagnosed),))))
     assert "Influence of curves" in shown_text
 
 
 def ends_of(result):
     """Lower and upper ends of all intervals; (lanes, P) each."""
-    found = [[judgement(result, k, i) for i in range(result.study.size)]
+    found = [[assess(result, k, i) for i in range(result.study.size)]
              for k in range(result.lanes)]  # fmt: skip
     return (
         np.array([[getattr(j, name) for j in row] for row in found]) for name in ("low", "high")
@@ -441,7 +441,7 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
     shares = ["–", *(f"{v}.00 %" for v in (14, 13, 12, 10, 9, 8, 7, 6, 5, 4, 3))]
     assert [row[3] for row in rows[:-1]] == shares
     assert further == "Worst first; and 2 more, see left_out.csv"
-    findings = Findings(dense, ((LEFT_OUT, left_out),))
+    findings = AnalysisResults(dense, ((LEFT_OUT, left_out),))
     text = report_text("T", findings, [])
     section = text.split("## Leaving one curve out")[1].split("##")[0]
     lines = [line for line in section.splitlines() if line.startswith("| ")][2:14]

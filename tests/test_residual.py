@@ -11,7 +11,7 @@ import synthetic
 from late import late
 from scipy.integrate import quad
 
-from jaxtrachea import _in_order
+from jaxtrachea import fusion
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.lanes import Noise, Weighting
@@ -201,7 +201,7 @@ def test_lanes_are_as_each_by_itself(subtests):
             each = jax.vmap(functools.partial(residual, study.model))
             program = jax.jit(each, compiler_options=QUICK).lower(theta, lanes).compile()
             with subtests.test(name=name, dtype=dtype):
-                whole = kernel and _in_order._one_kernel_p is not None and on_cpu
+                whole = kernel and fusion._one_kernel_p is not None and on_cpu
                 assert (ONE_KERNEL in program.as_text()) == whole
                 for k, alone in enumerate(evaluated(name)):
                     for got, true in zip(program(theta, lanes), alone[0], strict=True):

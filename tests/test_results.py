@@ -22,7 +22,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import left_out_table
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.labels import weakest_sentence
 from jaxtrachea.inference.residuals import rms, worst
@@ -65,7 +65,7 @@ def predicted(result, prediction):
     """Findings of a fit with these residuals."""
     result = dataclasses.replace(result)
     vars(result)["residuals"] = prediction
-    return Findings(result, ((EFFECTIVE, Findings(result)),))
+    return AnalysisResults(result, ((EFFECTIVE, AnalysisResults(result)),))
 
 
 def columns(heading):
@@ -81,11 +81,11 @@ def test_page_names_every_column(result):
     assert names[len(head) : len(head) + 5] == [
         *("k_1 [N/mm]", "k_1 se", "k_1 low95", "k_1 high95", "k_1 verdict")
     ]
-    assert list(next(parameter_rows(Findings(result)))) == columns("## parameters.csv")
+    assert list(next(parameter_rows(AnalysisResults(result)))) == columns("## parameters.csv")
 
 
 def test_page_names_every_dataset(result, tmp_path):
-    write_hdf5(tmp_path / "r.h5", Findings(result), {"a": 1})
+    write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {"a": 1})
     found = {}
     with h5py.File(tmp_path / "r.h5") as file:
         file.visititems(lambda name, item: found.__setitem__(name, getattr(item, "shape", None)))
@@ -96,7 +96,7 @@ def test_page_names_every_dataset(result, tmp_path):
     assert sorted(shapes) == sorted(columns("## results.h5"))
     assert shapes["unknowns/correlation"] == (2, 4, 4)
     with pytest.raises(FileExistsError):
-        write_hdf5(tmp_path / "r.h5", Findings(result), {})
+        write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
 
 
 def test_columns_that_gzip_makes_smaller_are_packed(tmp_path):
@@ -104,7 +104,7 @@ def test_columns_that_gzip_makes_smaller_are_packed(tmp_path):
     depth = np.round(np.linspace(0.001, 2, 2000), 3)
     noisy = depth + np.random.default_rng(0).normal(0, 0.01, depth.shape)
     study = build_study([Curve("A", "t", None, 0.0, depth, noisy)], table_1(), TOTAL)
-    write_hdf5(tmp_path / "r.h5", Findings(fit(study, Settings(starts=1))), {})
+    write_hdf5(tmp_path / "r.h5", AnalysisResults(fit(study, Settings(starts=1))), {})
     with h5py.File(tmp_path / "r.h5") as file:
         data = file["data"]
         packed = {name for name in data if data[name].compression == "gzip"}
@@ -117,7 +117,7 @@ def test_columns_that_gzip_makes_smaller_are_packed(tmp_path):
 def test_trialwise_unknowns_are_named_by_trial(result):
     labels = [unknown_label(result, 0, i) for i in range(4)]
     assert labels == ["k_1", "k_3", "force_offset[a]", "force_offset[b]"]
-    rows = list(parameter_rows(Findings(result)))
+    rows = list(parameter_rows(AnalysisResults(result)))
     assert [(r["specimen"], r["trial"]) for r in rows[:4]] == [
         *(("T1", "(all)"), ("T1", "(all)"), ("T1", "a"), ("T1", "b"))
     ]
@@ -133,7 +133,7 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
     assert bad["message"] == FitStatus.MAX_ITERATIONS.message
     assert bad["k_1 verdict"] == "failed"
     assert weakest_sentence(failed, 1) == "no estimate"
-    text = report_text("T", Findings(failed), [BAD])
+    text = report_text("T", AnalysisResults(failed), [BAD])
     assert "1 of 2 fits solved, 0 with every unknown determined; 1 curves could not be used" in text
     assert "| T9 | 1 | non_finite | line 3: force is nan | leave it out |" in text
     assert "max iterations" in text

@@ -44,7 +44,7 @@ PATH = np.linspace(0.5, 3.0, 6)
 TRUTH = {"EI_C": 31.0, "bed_n": 0.013}
 FIXED = {name: {"fixed": True} for name in ("bed_t", "Et_L", "D_L", "c_W")}
 SIGMA = 0.01
-ONE = Settings(starts=1, more_starts=0, scrutiny=False)
+ONE = Settings(starts=1, more_starts=0, verify=False)
 #: Threshold of chi^2 with one degree of freedom at 95 %.
 CHI2 = 3.841458820694124
 

@@ -30,7 +30,7 @@ from jaxtrachea.fitting.refusals import Size, check_curve
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.comparison import same_data
 from jaxtrachea.inference.posterior import posterior
 from jaxtrachea.inference.repeats import repeats
@@ -294,7 +294,7 @@ def test_known_parameters_are_found(tmp_path):
     assert not result.undetermined.any()
     with pytest.raises(ValueError, match="the posterior is not available.*'sections'"):
         posterior(result)
-    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
     with h5py.File(tmp_path / "r.h5") as file:
         data = {name: file["data"][name][()] for name in file["data"]}
     curves, n = study.curves[0], len(PATH)

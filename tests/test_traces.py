@@ -143,15 +143,15 @@ def test_what_is_lowered_is_not_kept(folder):
 def test_without_optimisation_the_trace_is_the_same(folder):
     """One file serves both; compiled are two programs."""
     x = np.linspace(0.1, 2.0, 5)
-    for quick in (False, True):
+    for unoptimised in (False, True):
         start()
-        run = Traced(add, quick=quick)
+        run = Traced(add, unoptimised=unoptimised)
         with compilations() as seen:
             out = run(np.full(5, 0.5), x)
         assert len(seen) >= 1
         np.testing.assert_allclose(out[0], 0.5 + x, rtol=1e-15)
         np.testing.assert_allclose(out[1], np.sin(x), rtol=1e-14)
-        assert (run._options == quick_options()) is quick
+        assert (run._options == quick_options()) is unoptimised
     assert TRACES == ["add"]
     assert len(list(folder.iterdir())) == 1
 

@@ -17,7 +17,7 @@ from jaxtrachea.config import SpecError
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.scene.ranges import unserved
+from jaxtrachea.scene.ranges import outside_plan
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.tradeoff import choice as choosing
@@ -224,11 +224,11 @@ def test_the_finest_level_is_no_wish_of_the_user():
     said = {e.name: e for e in full_scene(*staged(**arch)).scene.plan.effects}
     assert (said["rings"].level, said["rings"].forced) == ("arch2", False)
     assert said["second_plane"].reason == "arches need vectors"
-    wish = SCENE | {"effects": {"rings": "arch2"}}
-    said = {e.name: e for e in full_scene(*staged(wish, **arch)).scene.plan.effects}
+    requested = SCENE | {"effects": {"rings": "arch2"}}
+    said = {e.name: e for e in full_scene(*staged(requested, **arch)).scene.plan.effects}
     assert said["rings"].forced
-    wish = SCENE | {"effects": {"rings": "mat"}}
-    full = full_scene(*staged(wish, **arch))
+    requested = SCENE | {"effects": {"rings": "mat"}}
+    full = full_scene(*staged(requested, **arch))
     assert full.levels.plan.rings == "mat"
     assert not full.levels.plan.second_plane
 
@@ -309,7 +309,7 @@ def test_chosen_plan_is_within_the_tolerance():
     assert dropped[0] == {"shear", "local", "dtype"}
     assert dropped[0] > dropped[1] >= dropped[2] == {"dtype"} > dropped[3]
     assert {rung.ladder for rung in choice.refused} == {"shear", "local", "dtype"}
-    assert not choice.returned
+    assert not choice.restored
     assert "no program but the full one is within 1e-08 %" in choice.sentence
     assert choice.cost.share == 1
 
@@ -334,9 +334,9 @@ def test_two_effects_within_tolerance_can_break_it_together():
     assert loose.errors.worst > max(alone.values())
     tolerance = (loose.errors.worst + max(alone.values())) / 2
     choice = choose(full, tolerance, **kept)
-    assert len(choice.dropped) == len(choice.returned) == 1
+    assert len(choice.dropped) == len(choice.restored) == 1
     saved = {rung.ladder: rung.saved for rung in loose.dropped}
-    assert choice.returned[0].ladder == max(alone, key=lambda k: alone[k] / saved[k])
+    assert choice.restored[0].ladder == max(alone, key=lambda k: alone[k] / saved[k])
     assert choice.errors.worst <= tolerance
     reference = solve(full.scene, made.material, made.path)
     both = solve(plan(shear=False, local="uniform"), made.material, made.path)
@@ -366,7 +366,7 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
     assert not found.refused
     assert choosing._within(trial, "operations", ladder, 1e-4, found) is None
     assert {rung.level for rung in found.refused} == set(rungs)
-    assert not found.idle
+    assert not found.no_gain
 
 
 def test_a_choice_can_be_shown():
@@ -392,8 +392,8 @@ def test_a_choice_can_be_shown():
 
 
 def test_a_wish_is_kept():
-    wish = SCENE | {"effects": {"shear": "on"}}
-    choice = choose(full_scene(*staged(wish)), 0.1, precision="float64")
+    requested = SCENE | {"effects": {"shear": "on"}}
+    choice = choose(full_scene(*staged(requested)), 0.1, precision="float64")
     assert {rung.ladder for rung in choice.dropped} == {"local"}
     assert choice.material.k_1.dtype == float
     assert choice.levels.plan.options.shear
@@ -470,5 +470,5 @@ def test_no_rung_of_an_effect_is_refused_as_off_its_plan():
     for ladder in climbed.values():
         for rung in ladder.rungs:
             scene, material, path = program(full, ladder.levels(full, rung))
-            asked = unserved(scene, material, path, pressing)
+            asked = outside_plan(scene, material, path, pressing)
             assert asked is None or not asked.any(), (ladder.name, rung)

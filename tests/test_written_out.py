@@ -11,10 +11,10 @@ from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
 from kernels import count_kernels
 from late import late
 
-from jaxtrachea import _in_order
-from jaxtrachea._in_order import in_order, one_kernel
+from jaxtrachea import fusion
 from jaxtrachea._numerics import epsilon
 from jaxtrachea._written_out import written_out
+from jaxtrachea.fusion import fuse, in_order
 
 DTYPES = [*late("float32"), "float64"]
 #: Products as `einsum` names them, and the sizes of the two.
@@ -90,17 +90,17 @@ def compiled(f, *inputs):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_single_call_is_one_kernel_and_lanes_are_the_librarys(dtype):
     """One lane is a single call, too; values and derivatives are those of the function."""
-    if _in_order._one_kernel_p is None:
+    if fusion._one_kernel_p is None:
         pytest.skip("this jaxlib makes no single kernels")
     A, x = numbers((4, 4), (4,), dtype=dtype)
-    one = one_kernel(many, products=True)
+    one = fuse(many, products=True)
     lanes = jnp.stack([x, -x, 2 * x])
     assert count_kernels(compiled(one, A, x), inside=False)[0] == 1
     single = compiled(jax.vmap(one, (None, 0)), A, lanes[:1])
     assert count_kernels(single, inside=False)[0] == 1
     assert "dot(" not in single
     assert "dot(" in compiled(jax.vmap(one, (None, 0)), A, lanes)
-    assert "dot(" in compiled(one_kernel(many), A, x)
+    assert "dot(" in compiled(fuse(many), A, x)
 
     def slope(f):
         return jax.jit(lambda A, x, along: jax.jvp(f, (A, x), (jnp.sin(A), along)))
@@ -136,7 +136,7 @@ def test_what_does_not_fit_stays_with_the_library(what):
     def slope(f):
         return lambda A, x: jax.jvp(f, (A, x), (A, x))
 
-    got, wanted = (jax.jit(slope(f))(A, x) for f in (one_kernel(part, products=True), part))
+    got, wanted = (jax.jit(slope(f))(A, x) for f in (fuse(part, products=True), part))
     for a, b in zip(got, wanted, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtrachea.cli.specification import settings_of, study_of
 from jaxtrachea.config import FitSpec, load_fit_spec
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.result import FitResult, judgement
+from jaxtrachea.fitting.result import FitResult, assess
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.cross_validation import leave_one_out, refitted
 from jaxtrachea.inference.labels import peak_force
@@ -50,7 +50,7 @@ def record(result: FitResult) -> dict:
         "parameters": {
             p.name: {
                 "value": float(result.value[0, i]),
-                "se": None if result.at_bound[0, i] else judgement(result, 0, i).standard_error,
+                "se": None if result.at_bound[0, i] else assess(result, 0, i).standard_error,
                 "unit": p.unit,
             }
             for i, (p, _, _) in enumerate(result.study.unknowns[0])

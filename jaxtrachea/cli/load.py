@@ -72,7 +72,7 @@ def _with_depths(measurements, study, printed: set[str]):
     Nothing is fitted yet: a sought onset is taken where its curve shows it.
     """
     from jaxtrachea.fitting.onset import counted_from
-    from jaxtrachea.fitting.tested import deeper_than_tested
+    from jaxtrachea.fitting.validated_depth import deeper_than_validated
 
     model = study.model
     curves = [c for lane in study.curves for c in lane]
@@ -81,7 +81,7 @@ def _with_depths(measurements, study, printed: set[str]):
         for row, lane in zip(study.first_touch, study.curves, strict=True)
         for d in row[: len(lane)]
     ]
-    note = deeper_than_tested(
+    note = deeper_than_validated(
         curves, model.options, float(model.geometry.radius), touch, counted_from(study.parameters)
     )
     if note is None:

@@ -24,7 +24,7 @@ def refuse(path: Path, request) -> None:
 
 
 def run(request, stop_if_asked, fit=None):
-    """Fit, by `fit` if given, then what needs a fit; the `Findings`."""
+    """Fit, by `fit` if given, then what needs a fit; the `AnalysisResults`."""
     from jaxtrachea.fitting.fit import fit as in_one_go
     from jaxtrachea.inference.analyses import analyse
 

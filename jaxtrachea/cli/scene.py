@@ -177,7 +177,7 @@ def _chosen(path: Path, spec, staged):
         full = full_scene(spec, staged)
     except PlanError as error:
         raise Stop(f"{path}: effects.{error}") from None
-    wish = spec.plan
+    requested = spec.plan
     with interrupts() as ctrl_c, progress_bar() as bar:
         task = bar.add_task("choosing", total=None)
 
@@ -186,7 +186,9 @@ def _chosen(path: Path, spec, staged):
             bar.update(task, description=f"choosing: {text}", advance=1)
 
         try:
-            choice = choose(full, wish.tolerance, report, precision=wish.precision, by=wish.cost)
+            choice = choose(
+                full, requested.tolerance, report, precision=requested.precision, by=requested.cost
+            )
         except PlanError as error:
             raise Stop(f"{path}: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}

@@ -47,7 +47,7 @@ def selfcheck(
     from jaxtrachea.selfcheck.run import run_table
 
     out, found = Console(), []
-    found = list(run_table(cases, read_truth(), _Dtype[dtype].value, quick=quick))
+    found = list(run_table(cases, read_truth(), _Dtype[dtype].value, unoptimised=quick))
     if not found:
         raise Stop(f"--only, --dtype {dtype}: none of these cases is run in this dtype")
     seconds = time.perf_counter() - start

@@ -69,7 +69,7 @@ class Traced:
         *static: Any,
         axes: Any = None,
         donate: tuple[int, ...] = (),
-        quick: bool = False,
+        unoptimised: bool = False,
         **named: Any,
     ):
         """Nothing is traced yet.
@@ -79,14 +79,14 @@ class Traced:
             static: its first arguments.
             axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
             donate: of the other arguments, as `donate_argnums` of `jax.jit`.
-            quick: compiled without optimisation; the trace is the same.
+            unoptimised: compiled without optimisation; the trace is the same.
             named: static arguments by name.
         """
         self._name, self._donate = function.__name__, donate
         self._identity = (function, static, named, axes, donate)
         one = functools.partial(function, *static, **named)
         self._function = one if axes is None else jax.vmap(one, axes)
-        self._options = quick_options() if quick else None
+        self._options = quick_options() if unoptimised else None
         self._plain = jax.jit(self._function, donate_argnums=donate, compiler_options=self._options)
         self._compiled: dict[Any, Callable] = {}
         self._compiling: dict[Any, threading.Lock] = {}

@@ -29,7 +29,7 @@ def serves(study: Study, settings: Settings, starts: int) -> bool:
     lanes, model = study.lanes, study.model
     long = lanes.force.shape[-1] >= TIMES * KEPT and starts > QUICK[0]
     forces_alone = lanes.joints is None and not model.level.iterates
-    tells = forces_alone and lanes.blend is None and model.loss == "linear" and settings.scrutiny
+    tells = forces_alone and lanes.blend is None and model.loss == "linear" and settings.verify
     solver = settings.method == "levenberg-marquardt" and not settings.float32
     return long and tells and solver and not study.joint and jax.default_backend() == "cpu"
 

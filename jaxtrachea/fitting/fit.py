@@ -10,7 +10,7 @@ from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.doubt import doubtful, left_in_doubt
 from jaxtrachea.fitting.evaluate import evaluated
-from jaxtrachea.fitting.force_share import TURNS, changed, next_levels, with_levels
+from jaxtrachea.fitting.force_share import MAX_ITERATIONS, changed, next_levels, with_levels
 from jaxtrachea.fitting.joint_information import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
@@ -21,11 +21,11 @@ from jaxtrachea.fitting.minima import (
 from jaxtrachea.fitting.noise import next_sigma, normal_psi2, precision_unit
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.scrutiny import scrutinise
 from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.fitting.starts import scales
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.verify import verify_minimum
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
@@ -46,7 +46,7 @@ def fit(
 
     Failed lanes are rows with a status. Where the structure leaves a combination of unknowns open
     (`structure`), one of them is held, so that there is no valley to follow; where an estimate
-    gives cause for doubt, other minima are looked for and unknowns are profiled (`scrutiny`). A
+    gives cause for doubt, other minima are looked for and unknowns are profiled (`verify`). A
     lane that gives no cause costs nothing more. Where the noise of forces has a share of the force
     to be found (`Noise.force_share`), the fit is made in turns with it; the study of the result
     keeps what was found, and refits from it do, too.
@@ -69,9 +69,9 @@ def fit(
     if study.force_share is not None and study.shares is None:
         found = _with_force_share(found, settings, progress)
     result, minima, known = found
-    if not settings.scrutiny or study.joint:
+    if not settings.verify or study.joint:
         return dataclasses.replace(result, unexamined=left_in_doubt(result, minima))
-    return _scrutinised(result, minima, known, settings, progress)
+    return _verified(result, minima, known, settings, progress)
 
 
 class _Found(NamedTuple):
@@ -90,7 +90,7 @@ def _with_force_share(found: _Found, settings: Settings, progress) -> _Found:
     alive = None if progress is None else lambda done, of: progress(0, of)
     result, minima, known = found
     levels = None
-    for _ in range(TURNS):
+    for _ in range(MAX_ITERATIONS):
         before = levels
         levels, force = next_levels(result)
         rows = changed(before, levels)
@@ -138,13 +138,13 @@ def _unproven(result: FitResult, known: Structure) -> np.ndarray:
     return ~examined & ~(condition < PROVEN) & (known.nullity == 0)
 
 
-def _scrutinised(result, minima: Minima, known: Structure, settings, progress) -> FitResult:
-    """With the evidence of `scrutiny`; a better minimum found takes the estimate's place."""
+def _verified(result, minima: Minima, known: Structure, settings, progress) -> FitResult:
+    """With the evidence of `verify`; a better minimum found takes the estimate's place."""
     for turns_left in range(REPLACED, -1, -1):
         doubts = doubtful(result, minima)
         if not doubts.any():
             break
-        evidence, better = scrutinise(
+        evidence, better = verify_minimum(
             result, minima, doubts, settings, known, progress, last=not turns_left
         )
         rows = np.flatnonzero(np.isfinite(better).all(axis=1))

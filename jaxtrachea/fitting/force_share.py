@@ -19,7 +19,7 @@ from jaxtrachea.fitting.study import Shares, Study
 #: Gain in -2 ln L from which a share is taken; of noise without one 1 in 700 gains as much.
 WORTH = 9.0
 #: Fits in turns with the estimate, at most, and the relative change of sigma and share that ends.
-TURNS, STEADY = 8, 0.02
+MAX_ITERATIONS, SHARE_TOLERANCE = 8, 0.02
 #: Least sigma over the largest force, so that no sample of hardly any force counts alone.
 LEAST = 2e-4
 #: Shares over sigma, times the largest force, that are tried.
@@ -152,5 +152,5 @@ def changed(before: Levels | None, after: Levels) -> Int[np.ndarray, " n"]:
     if before is None:
         return np.flatnonzero(after.share > 0)
     pairs = zip(before, after, strict=True)
-    moved = [np.abs(b - a) > STEADY * np.maximum(a, b) for a, b in pairs]
+    moved = [np.abs(b - a) > SHARE_TOLERANCE * np.maximum(a, b) for a, b in pairs]
     return np.flatnonzero(np.any(moved, axis=0) & ((before.share > 0) | (after.share > 0)))

@@ -20,7 +20,7 @@ def map_lanes(
     static: tuple = (),
     dtype: Any = np.float64,
     progress: Callable[[int], None] | None = None,
-    quick: bool | None = None,
+    unoptimised: bool | None = None,
 ) -> Any:
     """`function(model, *static, array, lane, *arrays)` of many lanes.
 
@@ -34,8 +34,8 @@ def map_lanes(
         static: arguments between model and arrays, by value.
         dtype: of the computation.
         progress: called with the number of rows done since the last call.
-        quick: whether the program is compiled without optimisation; None: as for so many rows. Who
-            calls many times with few rows has to say.
+        unoptimised: whether the program is compiled without optimisation; None: as for so many
+            rows. Who calls many times with few rows has to say.
 
     Returns:
         What the function returns, on the host with leading axis n; floating-point arrays in
@@ -43,8 +43,8 @@ def map_lanes(
     """
     count = len(arrays[0])
     rows = np.arange(count) if rows is None else rows
-    quick = study.quick(count) if quick is None else quick
-    run, parts = program(function, study.model, *static, quick=quick), []
+    unoptimised = study.unoptimised(count) if unoptimised is None else unoptimised
+    run, parts = program(function, study.model, *static, unoptimised=unoptimised), []
     for first in range(0, count, batch):
         here = np.minimum(np.arange(first, first + batch), count - 1)
         lane = jax.tree.map(lambda v, at=rows[here]: v[at], study.lanes)

@@ -197,7 +197,7 @@ def _solve(
     if settings.method == "levenberg-marquardt":
         return levenberg_marquardt(
             LaneCost(study.model, study.lanes, sigma), starts, rows,
-            tolerances=settings.tolerances, quick=study.quick(together), **common,
+            tolerances=settings.tolerances, unoptimised=study.unoptimised(together), **common,
         )  # fmt: skip
     descent = Descent(settings.method, settings.tolerances)
     return descend(study, rows, starts, sigma, descent, **common)

@@ -80,10 +80,10 @@ def _compliance(result: FitResult, lanes, theta) -> Float[np.ndarray, "n points 
     bare = without_curves(study)
     read = bare.lanes._replace(joints=None, joint_precision=None)  # their motion is not asked for
     bare = dataclasses.replace(bare, lanes=read)
-    quick = study.quick(result.lanes)
+    unoptimised = study.unoptimised(result.lanes)
     c = map_lanes(
-        _felt_compliance, bare, theta, batch=FEW if quick else MANY, rows=np.repeat(lanes, rows),
-        quick=quick,
+        _felt_compliance, bare, theta, batch=FEW if unoptimised else MANY,
+        rows=np.repeat(lanes, rows), unoptimised=unoptimised,
     )  # fmt: skip
     return c.reshape(count, rows * TOGETHER, -1)[:, :points]
 

@@ -54,7 +54,7 @@ class Sides:
         self.first = np.where(np.isfinite(self.first), self.first, 1.0)
         starts = result.lanes * settings.starts
         self.batch = result.study.batch_size(max(starts, 16), settings.batch)
-        self.quick = result.study.quick(starts)
+        self.unoptimised = result.study.unoptimised(starts)
         self.sigma = result.whitened_sigma
         self.cost = self._costs_at_estimate()
 
@@ -107,7 +107,7 @@ class Sides:
         objective = LaneCost(chosen.model, chosen.lanes, self.sigma[pad(lanes)])
         solved = levenberg_marquardt(
             objective, start, tolerances=self.settings.tolerances, batch=self.batch,
-            quick=self.quick,
+            unoptimised=self.unoptimised,
         )  # fmt: skip
         return Solved(*(v[: len(lanes)] for v in solved))
 

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea._in_order import lanes_in_one_kernel
 from jaxtrachea.fitting import forward_residual
 from jaxtrachea.fitting.lane import Lane, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import SKELETON
+from jaxtrachea.fusion import fuse_batch
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.levels.level import Closed, Motion
@@ -228,7 +228,7 @@ def _skeleton_and_derivative(
         found = [push(jnp.asarray(t), free, at) for t in along]
         return found[0][0], jax.tree.map(lambda *v: jnp.stack(v, 1), *(t for _, t in found))
 
-    return lanes_in_one_kernel(pushed)(free, places.s_c, places.value)
+    return fuse_batch(pushed)(free, places.s_c, places.value)
 
 
 def _skeleton_of_lanes(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleton:
@@ -237,7 +237,7 @@ def _skeleton_of_lanes(model: FitModel, free, places: _Places, tube: Geometry) -
     def at(free, s_c, value):
         return _skeleton(model, free, places._replace(s_c=s_c, value=value), tube)
 
-    return lanes_in_one_kernel(at)(free, places.s_c, places.value)
+    return fuse_batch(at)(free, places.s_c, places.value)
 
 
 class _Contact(NamedTuple):

@@ -1,6 +1,6 @@
 """What a fit gives: estimates, errors, and of every unknown its verdict and its interval.
 
-Verdict and interval are decided here and nowhere else (`judgement`): terminal, report, tables,
+Verdict and interval are decided here and nowhere else (`assess`): terminal, report, tables,
 results.h5, the population and designs all ask. The interval is that of as many samples as are
 independent (`effective`); the one of independent residuals stands beside it.
 """
@@ -218,8 +218,8 @@ class FitResult:
         return Residuals(self.study, self.residuals, self.samples, self.at_bound, self.succeeded)
 
     @functools.cached_property
-    def judgements(self) -> "dict[tuple[int, int], Judgement]":
-        """Kept by `judgement`: those without further profiles, by lane and unknown."""
+    def assessments(self) -> "dict[tuple[int, int], Assessment]":
+        """Kept by `assess`: those without further profiles, by lane and unknown."""
         return {}
 
     def table(self, profiles: Intervals | None = None) -> Table:
@@ -240,7 +240,7 @@ class FitResult:
         `parameter` and `unit` say what each unknown is; statuses and verdicts are words. Lanes with
         fewer unknowns than others are filled up with NaN and "". Where an unknown lies on its bound
         (`at_bound`) its standard error is NaN, and so is its interval without a profile. Errors and
-        intervals are those of the tables (`judgement`).
+        intervals are those of the tables (`assess`).
 
         Args:
             profiles: further intervals, as for `table`.
@@ -258,7 +258,7 @@ class FitResult:
         size = self.theta.shape[1]
         labels = [[unknown_label(self, k, i) if i < len(study.unknowns[k]) else ""
                    for i in range(size)] for k in range(self.lanes)]  # fmt: skip
-        judged = [[judgement(self, k, i, profiles) if i < len(study.unknowns[k]) else None
+        assessed = [[assess(self, k, i, profiles) if i < len(study.unknowns[k]) else None
                    for i in range(size)] for k in range(self.lanes)]  # fmt: skip
         both, per_lane = ("lane", "unknown"), ("lane",)
 
@@ -275,10 +275,10 @@ class FitResult:
             "parameter": (both, labels),
             "unit": (both, units),
             "value": (both, self.value),
-            "standard_error": (both, [[end(j, "standard_error") for j in row] for row in judged]),
-            "low95": (both, [[end(j, "low") for j in row] for row in judged]),
-            "high95": (both, [[end(j, "high") for j in row] for row in judged]),
-            "verdict": (both, [[word(j) for j in row] for row in judged]),
+            "standard_error": (both, [[end(j, "standard_error") for j in row] for row in assessed]),
+            "low95": (both, [[end(j, "low") for j in row] for row in assessed]),
+            "high95": (both, [[end(j, "high") for j in row] for row in assessed]),
+            "verdict": (both, [[word(j) for j in row] for row in assessed]),
             "at_bound": (both, self.at_bound),
             "status": (per_lane, [FitStatus(int(v)).name.lower() for v in self.status]),
             "iterations": (per_lane, self.iterations),
@@ -306,7 +306,7 @@ BY_ANOTHER_BOUND = (5.991464547107979 / 3.841458820694124) ** 0.5
 DETERMINED = ("identifiable", "weak")
 
 
-class Judgement(NamedTuple):
+class Assessment(NamedTuple):
     """Verdict, interval and error of one unknown of one lane.
 
     Attributes:
@@ -335,7 +335,7 @@ class Judgement(NamedTuple):
     independent: tuple[float, float]
 
 
-def judgement(result: FitResult, lane: int, i: int, profiles: Intervals | None = None) -> Judgement:
+def assess(result: FitResult, lane: int, i: int, profiles: Intervals | None = None) -> Assessment:
     """Verdict and interval of an unknown: the one place where both are decided.
 
     Args:
@@ -345,17 +345,17 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Intervals | None =
         profiles: further profiles, which come on top.
     """
     if profiles is not None:
-        return _judged(result, lane, i, profiles)
-    if (lane, i) not in result.judgements:  # tables, files and report all ask
-        result.judgements[lane, i] = _judged(result, lane, i, None)
-    return result.judgements[lane, i]
+        return _assess(result, lane, i, profiles)
+    if (lane, i) not in result.assessments:  # tables, files and report all ask
+        result.assessments[lane, i] = _assess(result, lane, i, None)
+    return result.assessments[lane, i]
 
 
-def _judged(result: FitResult, lane: int, i: int, profiles: Intervals | None) -> Judgement:
+def _assess(result: FitResult, lane: int, i: int, profiles: Intervals | None) -> Assessment:
     plain_low, plain_high, ends = _unbounded(result, lane, i, profiles)
     independent = within_bounds(result, lane, i, plain_low, plain_high)
     if not result.succeeded[lane]:
-        return Judgement("failed", *independent, None, np.nan, np.nan, np.nan, independent)
+        return Assessment("failed", *independent, None, np.nan, np.nan, np.nan, independent)
     structural, held = bool(result.undetermined[lane, i]), bool(result.at_bound[lane, i])
     growth, misses = float(result.effective.growth[lane]), bool(result.effective.misses[lane])
     error = float(result.relative_se[lane, i])
@@ -370,7 +370,7 @@ def _judged(result: FitResult, lane: int, i: int, profiles: Intervals | None) ->
     low, high = _grown(result, lane, i, plain_low, plain_high, growth)
     open_ = ends is not None and ProfileEnd.OPEN in ends
     factor = np.nan if structural or open_ or misses else float(result.effective.factor[lane])
-    return Judgement(
+    return Assessment(
         word, *within_bounds(result, lane, i, low, high), ends, error,
         _finite(factor * float(result.standard_error[lane, i])),
         _finite(factor * float(result.relative_se[lane, i])), independent,
@@ -510,8 +510,8 @@ def _evidence(result: FitResult, lane: int, i: int, profiles: Intervals | None) 
 
 
 def verdict_of(result: FitResult, lane: int, i: int, profiles: Intervals | None = None) -> str:
-    """The verdict of `judgement`."""
-    return judgement(result, lane, i, profiles).verdict
+    """The verdict of `assess`."""
+    return assess(result, lane, i, profiles).verdict
 
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:
@@ -558,16 +558,16 @@ def estimate_rows(
     for lane, i in estimated(result):
         lane_specimen, _ = result.study.lane_name(lane)
         p, specimen, trial = result.study.unknowns[lane][i]
-        judged = judgement(result, lane, i, profiles)
+        assessed = assess(result, lane, i, profiles)
         yield {
             "specimen": (specimen or lane_specimen) if is_own(result, lane, i) else "(all)",
             "trial": trial or "(all)",
             "parameter": p.name,
             "unit": p.unit,
             "value": float(result.value[lane, i]),
-            "se": judged.standard_error,
-            "low95": judged.low,
-            "high95": judged.high,
-            "relative_se": judged.relative_se,
-            "verdict": judged.verdict,
+            "se": assessed.standard_error,
+            "low95": assessed.low,
+            "high95": assessed.high,
+            "relative_se": assessed.relative_se,
+            "verdict": assessed.verdict,
         }

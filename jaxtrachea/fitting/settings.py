@@ -30,7 +30,7 @@ class Settings:
         tolerances: when a lane is done.
         float32: compute in single precision (results are float64 all the same); without it a fit
             warns once where JAX has no double precision (`jax_enable_x64` is off).
-        scrutiny: look for other minima and profile where an estimate gives cause; False: verdicts
+        verify: look for other minima and profile where an estimate gives cause; False: verdicts
             rest on structure and local standard errors alone (for refits of which no one reads
             the verdicts).
     """
@@ -43,7 +43,7 @@ class Settings:
     batch: int = 128
     tolerances: Tolerances = Tolerances()
     float32: bool = False
-    scrutiny: bool = True
+    verify: bool = True
 
     def __post_init__(self):
         """Refuse words and numbers that mean nothing.

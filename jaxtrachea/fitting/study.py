@@ -50,8 +50,8 @@ from jaxtrachea.fitting.parameters import (
     in_model,
 )
 from jaxtrachea.fitting.refusals import Size, check_noise, refusal
-from jaxtrachea.fitting.tested import depths
-from jaxtrachea.fitting.unread import as_read
+from jaxtrachea.fitting.unused_observations import as_read
+from jaxtrachea.fitting.validated_depth import depths
 from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.levels.choose import level_of
@@ -260,7 +260,7 @@ class Study:
         """Lanes computed together, of `total`, of `most` and `most_together`: a size of few."""
         return batch_size(total, min(most, self.most_together))
 
-    def quick(self, count: int) -> bool:
+    def unoptimised(self, count: int) -> bool:
         """Whether `count` lanes take less time than it takes to optimise their program.
 
         Of a program without optimisation a lane takes about three times as long

@@ -60,7 +60,7 @@ class Request:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Findings:
+class AnalysisResults:
     """A fit, and what its analyses have found.
 
     Attributes:
@@ -124,7 +124,7 @@ class Analysis:
     """
 
     name: str
-    compute: Callable[[Request, Findings, Progress], Any]
+    compute: Callable[[Request, AnalysisResults, Progress], Any]
     after: str = ""
     work: str = ""
     option: str = ""

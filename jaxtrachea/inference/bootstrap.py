@@ -113,7 +113,7 @@ def bootstrap(
     result.study.refuse_joint("the bootstrap")
     seen = predictions(result.study, result.theta)
     batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
-    one = dataclasses.replace(settings, starts=1, batch=batch, scrutiny=False)
+    one = dataclasses.replace(settings, starts=1, batch=batch, verify=False)
     thetas, usable = [], []
     together = max(_AT_ONCE // count, 1)
     for first in range(0, result.lanes, together):

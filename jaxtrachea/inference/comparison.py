@@ -17,7 +17,7 @@ from jaxtrachea.measurements.observed import FURTHER_FIELDS
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
 #: (Burnham and Anderson 2002, sec. 2.6).
-ALIKE, DECISIVE = 2.0, 10.0
+INDISTINGUISHABLE, DECISIVE = 2.0, 10.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -279,7 +279,7 @@ def sentence(rows: Sequence[Row], left: str = "positions") -> str:
     predicts = min(rows, key=lambda row: row.left_out).model if known else ""
     gap = second.AICc - best.AICc
     said = f"AICc {gap:.1f} below {second.model}"
-    if gap < ALIKE:
+    if gap < INDISTINGUISHABLE:
         simple = min((best, second), key=lambda row: row.unknowns)
         return (
             f"these data cannot tell {best.model} from {second.model} (AICc differs by {gap:.1f}); "

@@ -232,7 +232,7 @@ def refitted(
     Returns:
         The fit, onsets and offsets of the trials left out, and residuals of all trials.
     """
-    plain = dataclasses.replace(settings, scrutiny=False)
+    plain = dataclasses.replace(settings, verify=False)
     result = fit(without(study, held), plain, progress, beside=estimate)
     touched = with_own_touch(study, held, result.theta, plain)
     return result, touched, predictions(study, touched.theta)

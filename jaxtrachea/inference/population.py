@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.parameters import Parameter
-from jaxtrachea.fitting.result import DETERMINED, FitResult, Intervals, judgement
+from jaxtrachea.fitting.result import DETERMINED, FitResult, Intervals, assess
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verdict import WEAK
 from jaxtrachea.inference.profile import Profiles
@@ -176,9 +176,9 @@ def weighing_errors(
     determined = np.zeros(result.theta.shape, bool)
     for lane, unknowns in enumerate(result.study.unknowns):
         for i in range(len(unknowns)):
-            judged = judgement(result, lane, i, profiles)
-            determined[lane, i] = judged.verdict in DETERMINED
-            if judged.verdict in WEIGHED:
+            assessed = assess(result, lane, i, profiles)
+            determined[lane, i] = assessed.verdict in DETERMINED
+            if assessed.verdict in WEIGHED:
                 local = float(result.relative_se[lane, i])
-                out[lane, i] = judged.error if np.isfinite(judged.error) else local
+                out[lane, i] = assessed.error if np.isfinite(assessed.error) else local
     return out, determined

@@ -22,9 +22,9 @@ from jaxtrachea.measurements.vectors import (
 )
 
 #: Positions that differ by less, mm and rad, are one: a stage of the rig stands no steadier.
-STEADY = {"s": 0.05, "phi": 1e-3}
+POSITION_TOLERANCE = {"s": 0.05, "phi": 1e-3}
 #: Below this correlation of force with displacement a curve has its force upside down.
-UPSIDE_DOWN = -0.5
+MIN_CORRELATION = -0.5
 
 
 def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
@@ -152,7 +152,7 @@ def position(
             raise Fault("position", f"{name} is {value:g} {unit}", "give a finite position")
     if own is None or common is None:
         return common if own is None else own
-    if abs(own - common) > STEADY[name]:
+    if abs(own - common) > POSITION_TOLERANCE[name]:
         raise Fault(
             "position",
             f"{name} is {own:g} {unit} in the {places[0]} but {common:g} {unit} in the {places[1]}",
@@ -205,7 +205,7 @@ def _check_signal(displacement: np.ndarray, force: np.ndarray) -> None:
         )
     # Scaled to unit range first: the squares of tiny forces would underflow.
     scaled = (displacement / np.ptp(displacement), force / np.ptp(force))
-    if np.corrcoef(*scaled)[0, 1] < UPSIDE_DOWN:
+    if np.corrcoef(*scaled)[0, 1] < MIN_CORRELATION:
         raise Fault(
             "sign",
             "force falls while displacement grows; inward displacement and resisting force count"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtrachea.units import UnitError, convert, parse_quantity
 
 #: Presses that one text may stand for.
-MOST = 100_000
+MAX_PRESSES = 100_000
 _KEYS = {"s": "s", "D": "D", "d": "D", "displacement": "D", "phi": "phi", "tilt": "tilt",
          "specimen": "specimen", "trial": "trial"}  # fmt: skip
 _START = re.compile(r",(?=\s*\w+\s*=)")
@@ -74,8 +74,8 @@ def parse_presses(text: str, *, needs_position: bool) -> Presses:
         raise ValueError(f"tilt = {found['tilt']}: the tool moves inwards; expected within 90 deg")
     s = _lengths("s", found["s"]) if "s" in found else None
     D = _lengths("D", found["D"])
-    if len(D) * (1 if s is None else len(s)) > MOST:
-        raise ValueError(f"{text!r} stands for more than {MOST} presses; take larger steps")
+    if len(D) * (1 if s is None else len(s)) > MAX_PRESSES:
+        raise ValueError(f"{text!r} stands for more than {MAX_PRESSES} presses; take larger steps")
     direction = (1.0, 0.0) if tilt == 0 else (float(np.cos(tilt)), float(np.sin(tilt)))
     return Presses(s, D, found.get("specimen"), found.get("trial"), phi, direction)
 
@@ -129,7 +129,7 @@ def _lengths(name: str, text: str) -> np.ndarray:
             "give START:STOP:STEP, whole steps from START, none beyond STOP"
         )
     count = (stop - start) / step
-    if count > MOST:
-        raise ValueError(f"{name}={text!r}: more than {MOST} values; take larger steps")
+    if count > MAX_PRESSES:
+        raise ValueError(f"{name}={text!r}: more than {MAX_PRESSES} values; take larger steps")
     whole = int(np.floor(count + 1e-9))
     return start + step * np.arange(whole + 1)

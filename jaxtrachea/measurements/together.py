@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.measurements.checks import UPSIDE_DOWN, finish, position
+from jaxtrachea.measurements.checks import MIN_CORRELATION, finish, position
 from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
 from jaxtrachea.measurements.holds import rises_evenly
 from jaxtrachea.measurements.observed import FURTHER_FIELDS
@@ -126,7 +126,7 @@ def _measured(raws: Sequence[RawCurve], options: ReadOptions) -> _Block:
             plain &= high <= options.displacement_max
         # A record that nowhere falls is a press: it begins at its lowest.
         plain &= _rises(displacement, edges) & rises_evenly(displacement, edges)
-        plain &= _along(displacement, force, edges) >= UPSIDE_DOWN + _MARGIN
+        plain &= _along(displacement, force, edges) >= MIN_CORRELATION + _MARGIN
         plain &= _noise_is_sound(raws, edges) & _time_is_even(raws, edges)
         plain &= ~suspicious(force, edges)
     lists = (low.tolist(), high.tolist(), peak.tolist())

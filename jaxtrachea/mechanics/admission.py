@@ -20,7 +20,7 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import VALUES, Material, meaningless
 
 
-class Admitted(NamedTuple):
+class Validated(NamedTuple):
     """What a press is computed with.
 
     Attributes:
@@ -41,7 +41,7 @@ def admit(
     used: Iterable[str],
     *,
     reach: float = 0.0,
-) -> Admitted:
+) -> Validated:
     """Check what a press is asked.
 
     Args:
@@ -63,7 +63,7 @@ def admit(
     refused = jnp.where(on, PressStatus.OK, PressStatus.OFF_TUBE)
     refused = jnp.where(~lost & ~jnp.isnan(s_c), refused, PressStatus.NON_FINITE)
     refused = jnp.where(bad, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
-    return Admitted(material, jnp.where(on, s_c, length / 2), refused)
+    return Validated(material, jnp.where(on, s_c, length / 2), refused)
 
 
 def check_place(geometry: Geometry, material: Material, s_c: ArrayLike) -> Float[Array, ""]:

@@ -123,7 +123,7 @@ def _reach(
         beam: the beam.
         s_c: mm.
         written_out: a comparison for each ring and no sum over them, which of many lanes no single
-            kernel can make (`_in_order.REDUCED`).
+            kernel can make (`fusion.REDUCED`).
     """
     ends, n = _ends(beam), beam.x.shape[0]
     if written_out:

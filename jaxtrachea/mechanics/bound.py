@@ -9,8 +9,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import ArrayLike, check_fits, real, shaped
-from jaxtrachea._in_order import one_kernel
 from jaxtrachea._packed import Packing
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.admission import check_alike, check_shapes
 from jaxtrachea.mechanics.press import Options, Press, check_line, press
 from jaxtrachea.trachea.geometry import Geometry
@@ -53,7 +53,7 @@ class BoundPress:
 
         like = jax.ShapeDtypeStruct((self.size,), self.dtype)
         self._result = Packing(jax.eval_shape(run, like))
-        whole = one_kernel(lambda numbers: self._result.pack(run(numbers)))
+        whole = fuse(lambda numbers: self._result.pack(run(numbers)))
         self._run: Callable = jax.jit(whole)
         self(self._given.fill(given))
 

@@ -17,7 +17,7 @@ from jaxtrachea._numerics import product, product_of_rows, turned
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
 from jaxtrachea.mechanics.admission import (
-    Admitted,
+    Validated,
     admit,
     check_place,
     float_type,
@@ -116,7 +116,7 @@ class Place(NamedTuple):
         onset: inward displacement at first touch, mm.
     """
 
-    asked: Admitted
+    asked: Validated
     unit: Skeleton
     law: Law
     phi_c: Float[Array, ""]

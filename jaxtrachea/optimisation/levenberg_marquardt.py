@@ -92,7 +92,7 @@ def levenberg_marquardt(
     batch: int = 128,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
-    quick: bool = False,
+    unoptimised: bool = False,
 ) -> Solved:
     """Minimise from every start.
 
@@ -105,7 +105,7 @@ def levenberg_marquardt(
             is 1, since compiling for another size takes longer.
         progress: called with the number of starts that finished since the last call.
         dtype: of the computation.
-        quick: the program is compiled without optimisation (see `program`).
+        unoptimised: the program is compiled without optimisation (see `program`).
 
     Returns:
         The `Solved` starts, in order. Failed ones are rows with a status; they touch no other row.
@@ -114,7 +114,7 @@ def levenberg_marquardt(
     rows = np.arange(total) if rows is None else rows
     batch = batch_size(max(total, 2), batch)
     exact, objective, given = objective, cast(objective, dtype), cast(starts, dtype)
-    advance = program(_advance, tolerances, ROUNDS, axes=None, donate=(3,), quick=quick)
+    advance = program(_advance, tolerances, ROUNDS, axes=None, donate=(3,), unoptimised=unoptimised)
     state = _idle(objective, batch, dtype)
     # What the slots of the batch compute with; rewritten only where a start takes its place.
     slots = jax.tree.map(lambda v: np.repeat(v[:1], batch, axis=0), (objective, given))

@@ -20,7 +20,7 @@ def program(
     *static,
     axes: Any = 0,
     donate: tuple[int, ...] = (),
-    quick: bool = False,
+    unoptimised: bool = False,
 ) -> Any:
     """`function(*static, ...)`, compiled; the same object for equal arguments.
 
@@ -29,9 +29,9 @@ def program(
         static: its first arguments, compared and hashed by value (`FitModel`, numbers, words).
         axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
         donate: of the other arguments, as `donate_argnums` of `jax.jit`.
-        quick: compiled without optimisation, in a third of the time: for little work.
+        unoptimised: compiled without optimisation, in a third of the time: for little work.
     """
-    return Traced(function, *static, axes=axes, donate=donate, quick=quick)
+    return Traced(function, *static, axes=axes, donate=donate, unoptimised=unoptimised)
 
 
 def batch_size(total: int, most: int) -> int:

@@ -39,7 +39,7 @@ class Response(NamedTuple):
     joint_side: Float[Array, "*n rings"] | None = None
 
 
-class Aside(NamedTuple):
+class OffMidline(NamedTuple):
     """Where a press is beside the position along the tube; of a level that presses there.
 
     Attributes:
@@ -95,7 +95,7 @@ def respond(
     s_c: Float[Array, ""],
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
-    aside: Aside | None = None,
+    aside: OffMidline | None = None,
 ) -> tuple[Response, Int[Array, " N"]]:
     """The fitted model at one position: response and `PressStatus`; pure.
 
@@ -174,7 +174,7 @@ def predicted(
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
     slack: Float[Array, "N F"] | None = None,
-    aside: Aside | None = None,
+    aside: OffMidline | None = None,
 ) -> Predicted:
     """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
 

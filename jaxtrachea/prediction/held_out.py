@@ -21,11 +21,11 @@ from jaxtrachea.fitting.zeros import resolved
 from jaxtrachea.measurements.observed import WITHOUT_VECTORS
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.prediction.core import Aside, force_and_slope
+from jaxtrachea.prediction.core import OffMidline, force_and_slope
 from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
 from jaxtrachea.prediction.pressed import pressed
-from jaxtrachea.prediction.sources import Source, source_of, value_of
+from jaxtrachea.prediction.sources import CurveParameters, source_of, value_of
 from jaxtrachea.status import FitStatus, PredictionStatus
 
 #: Standard deviations of the noise from which a force counts in the share that a band holds.
@@ -189,7 +189,7 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
     return "yes" if same else "changed"
 
 
-def _sigma(stored: FitResult, curve: Curve, source: Source) -> np.ndarray:
+def _sigma(stored: FitResult, curve: Curve, source: CurveParameters) -> np.ndarray:
     """Noise of a curve's samples, N: its own where that of the fit was given, else the fit's.
 
     Without the share of the force that it may have beside it.
@@ -201,10 +201,10 @@ def _sigma(stored: FitResult, curve: Curve, source: Source) -> np.ndarray:
 
 def with_own(
     stored: FitResult,
-    sources: Sequence[Source],
+    sources: Sequence[CurveParameters],
     curves: Sequence[Curve],
     sigmas: Sequence[np.ndarray],
-) -> list[Source]:
+) -> list[CurveParameters]:
     """Sources whose own parameters are fitted to their curves, all others kept as they are.
 
     The covariance of what is kept and of what is fitted follows to first order: d own / d kept is
@@ -217,7 +217,7 @@ def with_own(
             groups.setdefault(source.own, []).append(k)
     for own, members in groups.items():
         own_study = _own_study(stored, own, [(sources[k], curves[k], sigmas[k]) for k in members])
-        result = fit(own_study, Settings(scrutiny=False))
+        result = fit(own_study, Settings(verify=False))
         theta = result.theta[:, : len(own)] * _steps(stored.study, own_study, own)
         slopes = _slopes(stored, own, [sources[k] for k in members], theta, own_study)
         for row, k in enumerate(members):
@@ -294,7 +294,7 @@ def _steps(study: Study, own_study: Study, own) -> np.ndarray:
     return np.array([1.0 if q.scale == "log" else p.step / q.step for p, q in pairs])
 
 
-def _values(stored: FitResult, source: Source) -> np.ndarray:
+def _values(stored: FitResult, source: CurveParameters) -> np.ndarray:
     """All parameters in their units, the free ones as estimated; (J,)."""
     value = source.value.copy()
     for f, j in enumerate(stored.study.free_columns):
@@ -317,7 +317,9 @@ def _slopes(stored: FitResult, own, sources, theta, own_study: Study) -> list[np
     columns += [] if lanes.blend is None else [lanes.blend[:, 0]]
     more = {}
     if lanes.phi_c is not None and lanes.direction is not None:
-        more = {"aside": Aside(jnp.asarray(lanes.phi_c[:, 0]), jnp.asarray(lanes.direction[:, 0]))}
+        more = {
+            "aside": OffMidline(jnp.asarray(lanes.phi_c[:, 0]), jnp.asarray(lanes.direction[:, 0]))
+        }
     _, slopes = run(*map(jnp.asarray, columns), **more)
     return [np.asarray(slopes[k])[:, lanes.precision[k, 0] > 0] for k in range(len(sources))]
 
@@ -333,7 +335,7 @@ class _Own(NamedTuple):
     sigma: np.ndarray
 
 
-def _merged(stored: FitResult, source: Source, own: _Own) -> Source:
+def _merged(stored: FitResult, source: CurveParameters, own: _Own) -> CurveParameters:
     """The source with its own parameters and the covariance of all."""
     columns = list(own.columns)
     names = ", ".join(stored.study.free[f].name for f in columns)
@@ -360,7 +362,7 @@ def _merged(stored: FitResult, source: Source, own: _Own) -> Source:
         null_space=source.null_space @ follow.T,
         status=max(source.status, _own_status(own)),
         message=said,
-        absorbed=(own.slopes[moving].T, inverse @ (A / own.sigma[:, None]).T),
+        refitted_own=(own.slopes[moving].T, inverse @ (A / own.sigma[:, None]).T),
     )
 
 

@@ -13,7 +13,7 @@ from jaxtrachea.prediction.held_out import Compared
 from jaxtrachea.prediction.predict import CurvePrediction
 
 #: Panels of a picture, curves of a panel, and curves of the picture of all samples.
-PANELS, LINES, MOST = 12, 10, 200
+PANELS, LINES, MAX_CURVES = 12, 10, 200
 _ALL = "all: predictions.csv"
 
 
@@ -100,7 +100,7 @@ def _against(compared: Sequence[Compared]) -> Figure:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     ends = [0.0]
-    for c in compared[:MOST]:
+    for c in compared[:MAX_CURVES]:
         force, guess = c.curve.force, c.prediction.force
         known = np.isfinite(guess)
         new = c.in_fit != "yes"
@@ -112,6 +112,6 @@ def _against(compared: Sequence[Compared]) -> Figure:
     left.set(xlabel="measured [N]", ylabel="predicted [N]", title="+: used by the fit")
     right.axhline(0, color="k", lw=0.6)
     right.set(xlabel="displacement [mm]", ylabel="predicted - measured [N]", title="differences")
-    if len(compared) > MOST:
-        figure.suptitle(f"the first {MOST} of {len(compared)} curves; {_ALL}")
+    if len(compared) > MAX_CURVES:
+        figure.suptitle(f"the first {MAX_CURVES} of {len(compared)} curves; {_ALL}")
     return figure

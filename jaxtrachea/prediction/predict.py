@@ -21,13 +21,19 @@ from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.parameters import DECLARED
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.tested import depths, untested
+from jaxtrachea.fitting.validated_depth import depths, untested
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
+from jaxtrachea.prediction.core import Estimate, OffMidline, Predicted, Response, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
 from jaxtrachea.prediction.pressed import pressed
-from jaxtrachea.prediction.sources import Source, onset_of, slack_of, source_of, value_of
+from jaxtrachea.prediction.sources import (
+    CurveParameters,
+    detection_limit,
+    onset_of,
+    source_of,
+    value_of,
+)
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 #: Parts of parameters that say nothing of a skeleton.
@@ -137,7 +143,7 @@ class CurvePrediction:
 
 def predict_sources(
     stored: FitResult,
-    sources: list[Source],
+    sources: list[CurveParameters],
     s: list[float],
     displacements: list[np.ndarray],
     sigmas: Sequence[np.ndarray | None] | None = None,
@@ -171,14 +177,14 @@ def predict_sources(
     presses = zip(sources, s, padded, strict=True)
     slack = np.stack(
         [
-            slack_of(stored, source, (float(at), *how), D)
+            detection_limit(stored, source, (float(at), *how), D)
             for (source, at, D), how in zip(presses, turned, strict=True)
         ]
     )
     off = None
     if any(how != (0.0, (1.0, 0.0)) for how in turned):
         phis, ways = zip(*turned, strict=True)
-        off = Aside(jnp.asarray(np.array(phis, float)), jnp.asarray(np.array(ways, float)))
+        off = OffMidline(jnp.asarray(np.array(phis, float)), jnp.asarray(np.array(ways, float)))
     blend = stack("blend")
     out: dict[int, CurvePrediction] = {}
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
@@ -200,7 +206,7 @@ def predict_sources(
     return [out[k] for k in range(len(sources))]
 
 
-def _widened(source: Source, error: ModelError | None) -> Source:
+def _widened(source: CurveParameters, error: ModelError | None) -> CurveParameters:
     """The source with the covariance that alike residuals leave."""
     if error is None or error.growth == 1:
         return source
@@ -211,7 +217,7 @@ def _widened(source: Source, error: ModelError | None) -> Source:
 
 
 def _with_misfit(
-    stored: FitResult, source: Source, error: ModelError | None, found: CurvePrediction
+    stored: FitResult, source: CurveParameters, error: ModelError | None, found: CurvePrediction
 ) -> CurvePrediction:
     """The prediction with what the model misses, and why its bands are as wide as they are.
 
@@ -251,7 +257,9 @@ def _rounded(count: int, least: int) -> int:
     return max(least, 1 << (count - 1).bit_length())
 
 
-def _on_host(stored: FitResult, source: Source, where, displacement, part: Predicted, sigma):
+def _on_host(
+    stored: FitResult, source: CurveParameters, where, displacement, part: Predicted, sigma
+):
     """One curve at `where` (s, angle, direction), cut to its length, with its status."""
     n = len(displacement)
     s, phi, direction = where
@@ -313,7 +321,7 @@ def _on_host(stored: FitResult, source: Source, where, displacement, part: Predi
     )
 
 
-def _marker_sigma(stored: FitResult, source: Source, displacement) -> np.ndarray:
+def _marker_sigma(stored: FitResult, source: CurveParameters, displacement) -> np.ndarray:
     """Standard deviation of a marker at each displacement, mm; NaN if the fit had none."""
     given = stored.study.marker_noise
     if given is None or np.isnan(source.sigma[1]):
@@ -327,7 +335,9 @@ def _nothing(value: Response) -> np.ndarray:
     return np.full_like(value.joints, np.nan)
 
 
-def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepest: int) -> float:
+def _bend(
+    source: CurveParameters, off: np.ndarray, value: Response, se: Response, deepest: int
+) -> float:
     """Error of the linear band at its ends, at the deepest displacement, in half-widths.
 
     What the curve's own parameters take up does not count: they are fitted to it.
@@ -335,8 +345,8 @@ def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepes
     half = float(source.half_width * se.force[deepest])
     if not (np.isfinite(half) and half > 0 and np.isfinite(value.force[deepest])):
         return 0.0
-    if source.absorbed is not None:
-        slope, gain = source.absorbed
+    if source.refitted_own is not None:
+        slope, gain = source.refitted_own
         off = off - (off @ gain.T) @ slope.T
     worst = np.max(np.abs(off[:, deepest])) / half
     # No solution within the band (past a fold): as bent as can be.
@@ -366,7 +376,7 @@ def _beyond(spans: np.ndarray, s: float, depth: np.ndarray, aside=(), counted: s
     return f"extrapolated from data at {' and '.join(words)}" if words else ""
 
 
-def _verdict(source: Source, value: Response, se: Response, presses, bend: float):
+def _verdict(source: CurveParameters, value: Response, se: Response, presses, bend: float):
     """The worst that is to be said of a predicted curve, and everything in words."""
     found = [(source.status, source.message)]
     if source.status.predicts:

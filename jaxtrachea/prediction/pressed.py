@@ -10,7 +10,7 @@ import numpy as np
 from jaxtrachea.fitting.force_share import offsets
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.fitting.tested import depths
+from jaxtrachea.fitting.validated_depth import depths
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.vectors import tilt_of
 

@@ -15,7 +15,7 @@ OF_MEASUREMENT = ("onset", "force_offset", "force_slope")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Source:
+class CurveParameters:
     """Parameters of one curve; F free columns, J parameters.
 
     Attributes:
@@ -31,8 +31,8 @@ class Source:
         own: free columns that are the curve's own and not in the fit.
         status: OK, or the worst there is to say.
         message: why, in words; "" if nothing is.
-        absorbed: what own parameters take up of a change of the curve: slopes (N, k) and the gain
-            that fits them (k, N); None if they are not fitted.
+        refitted_own: what own parameters take up of a change of the curve: slopes (N, k) and the
+            gain that fits them (k, N); None if they are not fitted.
         blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; NaN: that of the
             options.
     """
@@ -49,7 +49,7 @@ class Source:
     own: tuple[int, ...]
     status: PredictionStatus
     message: str
-    absorbed: tuple[np.ndarray, np.ndarray] | None = None
+    refitted_own: tuple[np.ndarray, np.ndarray] | None = None
     blend: float = np.nan
 
 
@@ -60,7 +60,7 @@ def source_of(
     *,
     as_specimen: str | None = None,
     measured: bool = False,
-) -> Source:
+) -> CurveParameters:
     """The parameters to predict a curve with.
 
     Args:
@@ -109,7 +109,7 @@ def _counted(stored: FitResult, trial: str | None) -> str:
     return f"D and force as trial {trial!r} records them"
 
 
-def _from_first_touch(stored: FitResult, source: Source) -> Source:
+def _from_first_touch(stored: FitResult, source: CurveParameters) -> CurveParameters:
     """The source with no onset and no offset: a press that nobody records."""
     study = stored.study
     value = [0.0 if p.name in OF_MEASUREMENT else v
@@ -178,7 +178,7 @@ def _columns(stored: FitResult, lane: int, specimen: str, trial: str | None, wit
     return np.array(index, int), tuple(own)
 
 
-def _taken(stored: FitResult, specimen, trial, lane: int, index, own, note: str) -> Source:
+def _taken(stored: FitResult, specimen, trial, lane: int, index, own, note: str) -> CurveParameters:
     """The rows of the fit in the order of the free columns."""
     known = index >= 0
     pick = np.where(known, index, 0)
@@ -196,7 +196,7 @@ def _taken(stored: FitResult, specimen, trial, lane: int, index, own, note: str)
         if held:
             status = PredictionStatus.AT_BOUND
             said.append(f"{', '.join(held)} held")
-    return Source(
+    return CurveParameters(
         specimen=specimen,
         trial=trial,
         lane=lane,
@@ -212,12 +212,12 @@ def _taken(stored: FitResult, specimen, trial, lane: int, index, own, note: str)
     )
 
 
-def onset_of(stored: FitResult, source: Source) -> float:
+def onset_of(stored: FitResult, source: CurveParameters) -> float:
     """Displacement of a curve at first touch, mm, as it is predicted."""
     return value_of(stored, source, "onset")
 
 
-def value_of(stored: FitResult, source: Source, name: str) -> float:
+def value_of(stored: FitResult, source: CurveParameters, name: str) -> float:
     """A parameter of a curve as it is predicted, in its unit."""
     for p, scaled in zip(stored.study.free, source.free, strict=True):
         if p.name == name:
@@ -225,11 +225,13 @@ def value_of(stored: FitResult, source: Source, name: str) -> float:
     return float(source.value[[p.name for p in stored.study.parameters].index(name)])
 
 
-def _none(stored: FitResult, specimen, trial, status: PredictionStatus, message: str) -> Source:
+def _none(
+    stored: FitResult, specimen, trial, status: PredictionStatus, message: str
+) -> CurveParameters:
     """No parameters, and why; arrays of the usual shapes, so that one program serves all."""
     F, J = len(stored.study.free), len(stored.study.parameters)
     nan = np.full(F, np.nan)
-    return Source(
+    return CurveParameters(
         specimen=specimen,
         trial=trial or "",
         lane=-1,
@@ -245,9 +247,9 @@ def _none(stored: FitResult, specimen, trial, status: PredictionStatus, message:
     )
 
 
-def slack_of(
+def detection_limit(
     stored: FitResult,
-    source: Source,
+    source: CurveParameters,
     where: tuple[float, float, tuple[float, float]],
     displacement: np.ndarray,
 ) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import (
     NOTHING_FITTED,
     lane_label,
@@ -22,7 +22,7 @@ from jaxtrachea.report.tables import estimate_table, quality_table, spread_table
 
 def report_text(
     title: str,
-    findings: Findings,
+    findings: AnalysisResults,
     bad: Sequence[BadCurve],
     data: Sequence[str] = (),
     understood: Sequence[str] = (),
@@ -65,7 +65,7 @@ def report_text(
     return "\n\n".join(parts) + "\n"
 
 
-def _sections(findings: Findings, place: str) -> list[str]:
+def _sections(findings: AnalysisResults, place: str) -> list[str]:
     """Sections of the analyses that have theirs at this place."""
     lanes = listed(findings.result)
     return [
@@ -73,7 +73,7 @@ def _sections(findings: Findings, place: str) -> list[str]:
     ]
 
 
-def _estimates(findings: Findings) -> list[str]:
+def _estimates(findings: AnalysisResults) -> list[str]:
     """Values with their errors, and what the data leave open."""
     result, profiles = findings.result, findings.profiles
     shown = listed(result)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from jaxtrachea.files.table import Table
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import lane_label, outcome, verdict_sentence
 from jaxtrachea.inference.rows import listed
 from jaxtrachea.measurements.usage_tables import sentences
@@ -11,7 +11,7 @@ from jaxtrachea.report import tables
 from jaxtrachea.trials.repeats import trial_sentences
 
 
-def overview(findings: Findings) -> Iterator[Table | str]:
+def overview(findings: AnalysisResults) -> Iterator[Table | str]:
     """Tables and sentences of a run, in the order in which they are shown.
 
     Args:

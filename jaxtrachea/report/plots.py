@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from jaxtrachea.files.pictures import STYLE, grid, of_all, plain, save_each
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult, unknown_label
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
 
@@ -19,7 +19,7 @@ from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
 BANDED, BINS, FEWEST = 400_000, 60, 20
 
 
-def draw_all(folder: Path, findings: Findings) -> tuple[list[Path], dict[str, str]]:
+def draw_all(folder: Path, findings: AnalysisResults) -> tuple[list[Path], dict[str, str]]:
     """Write fit.png, residuals.png, if fitted correlation.png, and those of the analyses.
 
     Returns:
@@ -35,12 +35,12 @@ def draw_all(folder: Path, findings: Findings) -> tuple[list[Path], dict[str, st
     return _save(folder, drawings | _drawings(findings))
 
 
-def draw_analyses(folder: Path, findings: Findings) -> dict[str, str]:
+def draw_analyses(folder: Path, findings: AnalysisResults) -> dict[str, str]:
     """Write the pictures of the analyses alone; why one could not be drawn, by file name."""
     return _save(folder, _drawings(findings))[1]
 
 
-def _drawings(findings: Findings) -> dict[str, Any]:
+def _drawings(findings: AnalysisResults) -> dict[str, Any]:
     figures = (analysis.figures(found) for analysis, found in findings.found)
     return {name: draw for drawings in figures for name, draw in drawings.items()}
 

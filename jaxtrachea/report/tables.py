@@ -9,8 +9,8 @@ from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.result import (
     DETERMINED,
     FitResult,
+    assess,
     is_own,
-    judgement,
     said_before,
     unknown_label,
 )
@@ -49,15 +49,15 @@ def estimate_table(
         for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
             if said_before(result, lanes, lane, i):
                 continue
-            judged = judgement(result, lane, i, profiles)
+            assessed = assess(result, lane, i, profiles)
             rows.append(
                 {
                     "specimen": lane_label(result, lane) if is_own(result, lane, i) else "(all)",
                     "parameter": f"{unknown_label(result, lane, i)} [{p.unit}]",
                     "value": float(result.value[lane, i]),
-                    "std. error": judged.standard_error,
-                    "95 % interval": Interval(judged.low, judged.high, p.scale == "log"),
-                    "verdict": judged.verdict,
+                    "std. error": assessed.standard_error,
+                    "95 % interval": Interval(assessed.low, assessed.high, p.scale == "log"),
+                    "verdict": assessed.verdict,
                 }
             )
     more = and_more(result.lanes, len(lanes), "parameters.csv")
@@ -76,12 +76,12 @@ def spread_table(result: FitResult, profiles: Profiles | None = None) -> Table:
         for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
             if said_before(result, good, lane, i):
                 continue
-            judged = judgement(result, lane, i, profiles)
+            assessed = assess(result, lane, i, profiles)
             press = p.name in OF_THE_PRESS and p.scale == "linear"
-            error = judged.standard_error if press else judged.relative_se
+            error = assessed.standard_error if press else assessed.relative_se
             if press:
                 units[f"{p.name} [{p.unit}]"] = p.unit
-            entry = (float(result.value[lane, i]), error, judged.verdict)
+            entry = (float(result.value[lane, i]), error, assessed.verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
     for name, entries in columns.items():

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.files.table import Table
-from jaxtrachea.fitting.result import FitResult, judgement
-from jaxtrachea.inference.analysis import Analysis, Findings
+from jaxtrachea.fitting.result import FitResult, assess
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.results import store
 from jaxtrachea.results.arrays import PLACES, arrays_of
@@ -23,7 +23,7 @@ VERSION = 4
 
 def write_hdf5(
     path: Path,
-    findings: Findings,
+    findings: AnalysisResults,
     provenance: dict,
     reading: Mapping[str, object] | None = None,
 ) -> None:
@@ -87,12 +87,12 @@ def _add_verdicts(group: h5py.Group, result: FitResult, profiles: Profiles | Non
         cells = [[_cell(study.unknowns[lane], i, pick) for i in range(study.size)]
                  for lane in range(result.lanes)]  # fmt: skip
         group.create_dataset(field, data=cells, dtype=text)
-    judged = [[judgement(result, k, i, profiles) for i in range(len(study.unknowns[k]))]
+    assessed = [[assess(result, k, i, profiles) for i in range(len(study.unknowns[k]))]
               for k in range(result.lanes)]  # fmt: skip
-    words = [[j.verdict for j in row] + [""] * (study.size - len(row)) for row in judged]
+    words = [[j.verdict for j in row] + [""] * (study.size - len(row)) for row in assessed]
     for name in ("low", "high"):
         absent = [np.nan] * study.size
-        ends = [([getattr(j, name) for j in row] + absent)[: study.size] for row in judged]
+        ends = [([getattr(j, name) for j in row] + absent)[: study.size] for row in assessed]
         group.create_dataset(f"{name}95", data=ends, compression="gzip")
     group.create_dataset("verdict", data=words, dtype=text)
     group.attrs["units"] = json.dumps({p.name: p.unit for p in study.parameters})

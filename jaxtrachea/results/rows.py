@@ -7,12 +7,12 @@ import numpy as np
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import (
     FitResult,
+    assess,
     estimate_rows,
     estimated,
-    judgement,
     unknown_label,
 )
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import NOTHING_FITTED
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.residuals import rms
@@ -74,19 +74,21 @@ def _unknown_cells(
         if sum(unknowns[k][0].name == p.name for k in own) > 1:
             more.append(unknown_label(result, lane, i))
             continue
-        judged = judgement(result, lane, i, profiles)
+        assessed = assess(result, lane, i, profiles)
         cells |= {
             f"{p.name} [{p.unit}]": float(result.value[lane, i]),
-            f"{p.name} se": judged.standard_error,
-            f"{p.name} low95": judged.low,
-            f"{p.name} high95": judged.high,
-            f"{p.name} verdict": judged.verdict,
+            f"{p.name} se": assessed.standard_error,
+            f"{p.name} low95": assessed.low,
+            f"{p.name} high95": assessed.high,
+            f"{p.name} verdict": assessed.verdict,
         }
     said = f"{', '.join(more)}: see parameters.csv" if more else ""
     return cells | ({"more": said} if more else {})
 
 
-def summary_rows(findings: Findings, bad: Sequence[BadCurve] = ()) -> list[dict[str, object]]:
+def summary_rows(
+    findings: AnalysisResults, bad: Sequence[BadCurve] = ()
+) -> list[dict[str, object]]:
     """All rows of summary.csv: those of the lanes, then curves that could not be used."""
     rows = list(lane_rows(findings.result, findings.profiles))
     rows = with_residuals(findings.result, rows, findings.result.residuals)
@@ -106,7 +108,7 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
     }
 
 
-def parameter_rows(findings: Findings) -> Iterator[dict[str, object]]:
+def parameter_rows(findings: AnalysisResults) -> Iterator[dict[str, object]]:
     """One row per lane and unknown for parameters.csv, with what the analyses have to add.
 
     What the lanes of a joint fit share has one row, that of the first lane which succeeded.

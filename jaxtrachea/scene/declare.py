@@ -87,7 +87,7 @@ class Case(NamedTuple):
     finest: frozenset[str] = frozenset()
 
     @property
-    def led(self) -> bool:
+    def prescribed(self) -> bool:
         """Whether displacements count as they are: a press of its own is along the normal."""
         return self.levels["contact_point"] == "fixed" or not self.facts.poses
 
@@ -123,7 +123,7 @@ class Effect:
         material: optional values of the material that it reads.
         either: one of those is enough.
         requires: effects without which it cannot be.
-        brings: effects that have to be on with it, and so are.
+        implies: effects that have to be on with it, and so are.
         holds: effects that do not go alone while it is on.
         rungs: levels of its ladder from coarse to fine; empty: it is not traded.
         ladder_kind: whether a truncation is climbed, or a model.
@@ -143,7 +143,7 @@ class Effect:
     material: tuple[str, ...] = ()
     either: bool = False
     requires: tuple[str, ...] = ()
-    brings: tuple[str, ...] = ()
+    implies: tuple[str, ...] = ()
     holds: tuple[str, ...] = ()
     rungs: tuple[str, ...] = ()
     ladder_kind: Literal["truncation", "model"] = "model"

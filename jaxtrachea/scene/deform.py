@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxtrachea._in_order import in_turn, one_kernel
 from jaxtrachea._numerics import WRITTEN_OUT, full_precision, product
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
+from jaxtrachea.fusion import fuse, map_sequentially
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
@@ -72,9 +72,11 @@ def deform(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach
         # No lanes of the weights: of many such paths together they would be in memory for all.
         where = where if together else jax.tree.map(lambda v: v[0], where)
         moved, led = jax.tree.map(lambda v: v[0], (moved, led))
-        return in_turn(one)(moved, where, led, None)[None]
+        return map_sequentially(one)(moved, where, led, None)[None]
     share = regions.weigh(binding, where[1]) if together else None
-    return jax.vmap(in_turn(one), (0, None if together else 0, 0, None))(moved, where, led, share)
+    return jax.vmap(map_sequentially(one), (0, None if together else 0, 0, None))(
+        moved, where, led, share
+    )
 
 
 def _held_at(scene: Scene, s_c):
@@ -169,9 +171,9 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
     radius = scene.radius if radius is None else radius
     if tool is None or scene.tool is None:
         # Rows may share the contact point: outside of a part, all of whose results have lanes.
-        where, share = centres(s_c, phi_c, radius), one_kernel(evenly)(depth)
+        where, share = centres(s_c, phi_c, radius), fuse(evenly)(depth)
     else:
-        where, share = one_kernel(lay_out)(s_c, phi_c, radius, tool, depth)
+        where, share = fuse(lay_out)(s_c, phi_c, radius, tool, depth)
     return local.fit(where, share[:, None], local.REACH * spacing, depth)
 
 

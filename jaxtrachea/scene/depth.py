@@ -93,11 +93,13 @@ def skeleton(case: Case) -> Verdict:
         return Verdict("linear", f"{far}: {_LITTLE}", refused)
     if not cannot:
         why = f"{far}, and e_1 and e_2 are given"
-        return Verdict("softening", why, refused, doubt=_untested(line.TESTED["softening"], share))
+        return Verdict(
+            "softening", why, refused, doubt=_untested(line.VALIDATED_DEPTH["softening"], share)
+        )
     if given and case.options.skeleton == "auto":
         raise PlanError("skeleton", "'auto'", f"{far}, and {cannot}", cure)
     doubt = ""
-    if share > line.TESTED["linear"]:
+    if share > line.VALIDATED_DEPTH["linear"]:
         doubt = f"but {far}: {_TOO_STIFF}; {_MIDLINE}"
     return Verdict("linear", f"{far}; {cannot}", refused, doubt=doubt)
 
@@ -111,7 +113,7 @@ def _sections(case: Case) -> Verdict:
     facts, options, levels = case.facts, case.options, case.levels
     why, cure = "the material is that of deforming cross-sections", "use 'sections', or 'auto'"
     refused = {"linear": (why, cure), "softening": (why, cure)}
-    if case.led and facts.along > 0:
+    if case.prescribed and facts.along > 0:
         why = "the tool moves along the tube, which deforming cross-sections do not follow"
         raise PlanError("skeleton", "'sections'", why, "press across it: one x in all rows")
     if facts.poses and levels["contact_point"] == "per_step":
@@ -127,4 +129,6 @@ def _sections(case: Case) -> Verdict:
         cure = "set contact = 'bonded' and no other key of [model]"
         raise PlanError("skeleton", "'sections'", str(error), cure) from None
     why = "the material is that of deforming cross-sections"
-    return Verdict("sections", why, refused, doubt=_untested(sections.TESTED, reached(case)))
+    return Verdict(
+        "sections", why, refused, doubt=_untested(sections.VALIDATED_DEPTH, reached(case))
+    )

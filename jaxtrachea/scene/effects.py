@@ -64,7 +64,7 @@ def _second_plane(case: Case) -> Verdict:
     facts, options, must = case.facts, case.options, ""
     if facts.angle > 0:
         must = f"the contact lies up to {math.degrees(facts.angle):.3g} deg off the midline"
-    elif case.led and (facts.along > 0 or facts.across > 0):
+    elif case.prescribed and (facts.along > 0 or facts.across > 0):
         must = "the tool's motion is oblique"
     elif case.levels["friction"] == "on":
         must = "friction works in the tangent plane"
@@ -100,7 +100,7 @@ def _rings(case: Case) -> Verdict:
 
 
 def _axial(case: Case) -> Verdict:
-    needed = case.led and case.facts.along > 0
+    needed = case.prescribed and case.facts.along > 0
     cannot = "" if EFFECTS["axial"].given(case.facts.known) else "EA_L is not given"
     reason = "the tool moves along the tube" if needed else "no motion along the tube"
     if needed and cannot:
@@ -208,14 +208,14 @@ class EffectOptions:
         _contact_point, least="", values={}
     )
     friction: Switch = _effect(
-        _friction, brings=("second_plane",), holds=("second_plane",), rungs=ON_OFF
+        _friction, implies=("second_plane",), holds=("second_plane",), rungs=ON_OFF
     )
     second_plane: Switch = _effect(_second_plane, rungs=ON_OFF)
     rings: Literal["auto", "mat", "arch", "arch2"] = _effect(
-        _rings, least="mat", values={}, material=("EI_C", "k_t"), brings=("second_plane",),
+        _rings, least="mat", values={}, material=("EI_C", "k_t"), implies=("second_plane",),
         rungs=("mat", "arch", "arch2"),
     )  # fmt: skip
-    axial: Switch = _effect(_axial, material=("EA_L",), brings=("second_plane",), rungs=ON_OFF)
+    axial: Switch = _effect(_axial, material=("EA_L",), implies=("second_plane",), rungs=ON_OFF)
     surface: Literal["auto", "off", "linear", "hermite", "phong", "sections"] = _effect(
         _surface, values={"off": None}, rungs=("linear", "phong", "hermite"),
         ladder="interpolation",
@@ -291,5 +291,5 @@ def given_values(material: AnyMaterial) -> frozenset[str]:
 
 def goes_with(name: str) -> set[str]:
     """Effects that cannot be without this one, and those that cannot be without them."""
-    own = {e.name for e in EFFECTS.values() if name in (*e.requires, *e.brings)}
+    own = {e.name for e in EFFECTS.values() if name in (*e.requires, *e.implies)}
     return own.union(*map(goes_with, own))

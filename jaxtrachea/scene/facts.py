@@ -26,8 +26,8 @@ from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
 from jaxtrachea.surface import local
 from jaxtrachea.trachea.material import DEEP
 
-#: Rows that a path is filled up to, or twice, four times ...; longer ones than `MOST` are not.
-LEAST, MOST = 64, 4096
+#: Rows that a path is filled up to, or twice, four times ...; longer ones than `MAX_ROWS` are not.
+MIN_ROWS, MAX_ROWS = 64, 4096
 
 
 def facts_of(
@@ -122,9 +122,9 @@ def _what_is_touched(scene: Scene, curved: bool) -> Scene:
 def _filled_up(path: Poses) -> Poses:
     """The path to a round number of rows by its last pose: paths of any length share a program."""
     rows = len(path.translation)
-    if rows > MOST:
+    if rows > MAX_ROWS:
         return path
-    round_number = LEAST
+    round_number = MIN_ROWS
     while round_number < rows:
         round_number *= 2
     filled = np.minimum(np.arange(round_number), rows - 1)

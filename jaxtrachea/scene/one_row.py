@@ -1,6 +1,6 @@
 """A program of one row that is called many times: numbers go in and out as few arrays.
 
-All but the surface is one kernel (`_in_order`); what there is for every ring or vertex is written
+All but the surface is one kernel (`fusion`); what there is for every ring or vertex is written
 where that of the call before was.
 """
 
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxtrachea._in_order import one_kernel
 from jaxtrachea._packed import Packing
+from jaxtrachea.fusion import fuse
 from jaxtrachea.scene.simulation import Simulation, surface
 from jaxtrachea.scene.stage import Scene
 
@@ -64,7 +64,7 @@ class OneRow:
             return state, contacts.pack(contact), tuple(large.values()), press
 
         def run(state, _, *given):
-            state, contact, large, press = one_kernel(line)(state, *given)
+            state, contact, large, press = fuse(line)(state, *given)
             vertices = surface(setting(*given)[0], *press) if shown else None
             return state, contact, large if vertices is None else (*large, vertices[0])
 
@@ -75,13 +75,13 @@ class OneRow:
         self.state = jnp.array(state)
         names = [n for n in Simulation._fields if getattr(contact, n) is not None]
         where = {name: i for i, name in enumerate([*names, *large])}
-        self._in_order = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
+        self.fusion = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
 
     def __call__(self, *given: Any) -> Simulation:
         """The finished result: numpy arrays, and `LARGE` on the device until the next call."""
         self.state, packed, self._large = self._run(self.state, self._large, *given)
         contact = self._contacts.leaves(np.asarray(packed))  # waits for all of them
-        return Simulation._make(self._in_order((*contact, *self._large, None)))
+        return Simulation._make(self.fusion((*contact, *self._large, None)))
 
 
 def _apart(result: Simulation) -> tuple[Simulation, dict[str, Array]]:

@@ -38,7 +38,7 @@ class Decision:
 
 
 @dataclasses.dataclass(frozen=True)
-class Served:
+class ValidRange:
     """Presses that a plan within a tolerance was measured for; rows beyond are off the plan.
 
     Attributes:
@@ -76,7 +76,7 @@ class Plan:
         options: of the model.
         ignored: effects that stay off (the contact point: that stays) whatever a path needs,
             because the user wished it or a tolerance allows it. A row that needs any other effect
-            that is off is refused by status (`ranges.unserved`).
+            that is off is refused by status (`ranges.outside_plan`).
         served: presses that a tolerance was measured for; None: no tolerance.
         effects: all decisions in words; they do not count in comparisons.
     """
@@ -95,7 +95,7 @@ class Plan:
     ring_ends: bool
     options: Options
     ignored: frozenset[str] = frozenset()
-    served: Served | None = None
+    served: ValidRange | None = None
     effects: tuple[Decision, ...] = dataclasses.field(default=(), compare=False, repr=False)
 
     def __post_init__(self):
@@ -191,7 +191,7 @@ class Plan:
         made = dataclasses.replace(self, options=dataclasses.replace(self.options, **model), **own)
         lost = {
             e.name: e.least for e in EFFECTS.values()
-            if made.has(e.name) and not all(map(made.has, (*e.requires, *e.brings)))
+            if made.has(e.name) and not all(map(made.has, (*e.requires, *e.implies)))
         }  # fmt: skip
         return made.at(**lost) if lost else made
 

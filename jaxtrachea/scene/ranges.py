@@ -24,7 +24,7 @@ from jaxtrachea.scene.needs import (
     off_midline,
     slides,
 )
-from jaxtrachea.scene.plan import Served
+from jaxtrachea.scene.plan import ValidRange
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.surface import local
 
@@ -45,7 +45,7 @@ def lacking(scene: Scene, material: AnyMaterial) -> list[str]:
     ]  # fmt: skip
 
 
-def unserved(
+def outside_plan(
     scene: Scene, material: AnyMaterial, presses: Presses, pressing: Bool[Array, " rows"]
 ) -> Bool[Array, " rows"] | None:
     """Rows that press and need an effect that is off.
@@ -91,7 +91,7 @@ def unserved(
     return pressing & functools.reduce(jnp.logical_or, found) if found else None
 
 
-def _beyond(served: Served, presses: Presses):
+def _beyond(served: ValidRange, presses: Presses):
     """Rows outside of what the tolerance of the plan was measured for."""
     D, phi, s = presses.displacement, presses.phi, presses.s
     c, n = jnp.cos(phi), jnp.sin(phi)

@@ -17,7 +17,7 @@ from jaxtrachea.mechanics.skeleton import read_values as skeleton_values
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.lumen import off_the_end
-from jaxtrachea.scene.ranges import DEEPEST, unserved
+from jaxtrachea.scene.ranges import DEEPEST, outside_plan
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.status import ContactStatus, PressStatus
 
@@ -66,7 +66,7 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
     if made is not None:
         outside = pressing & (outside | off_the_end(scene, made.own))
     refused = {PressStatus.OFF_TUBE: outside}
-    unlike = unserved(scene, material, presses, acting)
+    unlike = outside_plan(scene, material, presses, acting)
     if unlike is not None:
         refused[PressStatus.OFF_PLAN] = unlike
     s, mid, behind = on_the_tube(scene, presses.s, phi)

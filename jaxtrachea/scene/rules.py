@@ -55,11 +55,11 @@ def _decided(effect: Effect, case: Case) -> Decision:
     Raises:
         PlanError: a wish that cannot be met.
     """
-    verdict, wish = effect.rule(case), getattr(case.options, effect.name)
-    if wish in verdict.refused:
-        raise PlanError(effect.name, repr(wish), *verdict.refused[wish])
-    free = wish != "auto" and verdict.free
-    level = case.levels[effect.name] = wish if free else verdict.level
+    verdict, requested = effect.rule(case), getattr(case.options, effect.name)
+    if requested in verdict.refused:
+        raise PlanError(effect.name, repr(requested), *verdict.refused[requested])
+    free = requested != "auto" and verdict.free
+    level = case.levels[effect.name] = requested if free else verdict.level
     if not free:
         return Decision(effect.name, level, verdict.reason, doubt=verdict.doubt)
     if effect.name in case.finest:

@@ -20,25 +20,25 @@ from jaxtrachea.contact.pose import check_rotations, is_rotation
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_alike
 from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.scene.anchor import (
+    Anchor,
+    Instant,
+    anchor_at,
+    as_approach,
+    first_contact,
+    follow,
+    has_left,
+    place_of,
+    press_vector,
+    re_anchor,
+    yielded,
+)
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.held_force import HeldForce, held_force, next_force, no_force
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.one_row import OneRow
-from jaxtrachea.scene.seat import (
-    Instant,
-    Seat,
-    anchored,
-    arrive,
-    as_approach,
-    drawn,
-    given_way,
-    grasp,
-    left,
-    place_of,
-    way_of,
-)
 from jaxtrachea.scene.simulation import Simulation, pressed
 from jaxtrachea.scene.stage import Poses, Scene, check_material, touch_tube
 from jaxtrachea.status import PressStatus
@@ -53,17 +53,17 @@ class State(NamedTuple):
 
     Attributes:
         started: there was a step.
-        touching: the tool is on its seat.
+        touching: the tool is on its anchor.
         side: a `lumen.Side`.
         last: the step before.
-        seat: the place that the tool holds.
+        anchor: the place that the tool holds.
     """
 
     started: Bool[Array, ""]
     touching: Bool[Array, ""]
     side: Int[Array, ""]
     last: Instant
-    seat: Seat
+    anchor: Anchor
 
 
 class Latency(NamedTuple):
@@ -125,8 +125,8 @@ class Session:
     """A scene and its material, compiled for one pose at a time.
 
     With `contact_point` fixed the tool stays on the place it touched first, as in `simulate`,
-    until that seat gives way (`scene.seat`): led along the surface by more than its depth the tool
-    slides, after a jump it grasps anew, and it lets go where it leaves the undeformed tube
+    until that anchor gives way (`scene.anchor`): led along the surface by more than its depth the
+    tool slides, after a jump it grasps anew, and it lets go where it leaves the undeformed tube
     (`simulate` keeps the first place of its whole path; a bonded tool never lets go). Force is
     continuous in the pose. A pose that is not finite is a row of NaN with NON_FINITE and changes
     nothing else.
@@ -229,8 +229,8 @@ class Session:
     def set_material(self, material: Material) -> None:
         """Go on with other values of the material; nothing is compiled.
 
-        The tool stays on its seat (`reset` lets it begin anew). A single number may stand where the
-        session was made with an array: it holds for every span or ring.
+        The tool stays on its anchor (`reset` lets it begin anew). A single number may stand where
+        the session was made with an array: it holds for every span or ring.
 
         Args:
             material: the values that the session was made with, no more and no less.
@@ -300,7 +300,7 @@ def _start(scene: Scene, rotation, translation) -> State:
     )
     no, nowhere = jnp.asarray(False), Instant(path, seen)
     side = jnp.asarray(Side.UNTOLD)
-    return State(started=no, touching=no, side=side, last=nowhere, seat=grasp(scene, nowhere))
+    return State(started=no, touching=no, side=side, last=nowhere, anchor=anchor_at(scene, nowhere))
 
 
 @full_precision
@@ -313,7 +313,7 @@ def _step(scene: Scene, material: Material, state: State, rotation, translation)
     side = next_side(state.side, at)
     inside = (side == Side.IN_LUMEN)[None]
     if each is None:
-        after, path, each, place = _held(scene, material, state, here, inside)
+        after, path, each, place = _holding(scene, material, state, here, inside)
     else:
         after, each, place = state, each._replace(inside=inside), None
     result, press = pressed(scene, material, path, each, place)
@@ -324,28 +324,28 @@ def _step(scene: Scene, material: Material, state: State, rotation, translation)
     return _pick(at.known, after, state), result, (path, press)
 
 
-def _held(scene: Scene, material: Material, state: State, here: Instant, inside):
+def _holding(scene: Scene, material: Material, state: State, here: Instant, inside):
     """The next state but for the side; pose and way of a tool that holds its place; the place."""
     depth = -here.seen.gap[0]
     hit = (depth > 0) & ~inside[0]
     last = _pick(state.started, state.last, here)
-    first = _pick(hit, arrive(scene, last, here), grasp(scene, here))
+    first = _pick(hit, first_contact(scene, last, here), anchor_at(scene, here))
     if scene.plan.options.contact == "bonded":
-        seat = _pick(state.touching, state.seat, first)
+        anchor = _pick(state.touching, state.anchor, first)
         touching = hit | state.touching
-        place, way = place_of(scene, material, seat), way_of(scene, seat, here.path)
+        place, way = place_of(scene, material, anchor), press_vector(scene, anchor, here.path)
         way = jnp.where(touching, way, 0)
     else:
         held = state.touching & hit
-        away = held & left(scene, state.seat, last, here)
-        seat = _pick(held, drawn(scene, state.seat, here), first)
-        seat, touching = _pick(away, grasp(scene, here), seat), hit
-        place, way = place_of(scene, material, seat), way_of(scene, seat, here.path)
-        way = jnp.where(hit, given_way(scene, way, jnp.where(hit, depth, 1), place), way)
-        seat = anchored(scene, seat, way, here.path)
-    rest, made = as_approach(scene, seat, way, here, inside)
+        away = held & has_left(scene, state.anchor, last, here)
+        anchor = _pick(held, follow(scene, state.anchor, here), first)
+        anchor, touching = _pick(away, anchor_at(scene, here), anchor), hit
+        place, way = place_of(scene, material, anchor), press_vector(scene, anchor, here.path)
+        way = jnp.where(hit, yielded(scene, way, jnp.where(hit, depth, 1), place), way)
+        anchor = re_anchor(scene, anchor, way, here.path)
+    rest, made = as_approach(scene, anchor, way, here, inside)
     started = jnp.asarray(True)
-    after = State(started=started, touching=touching, side=state.side, last=here, seat=seat)
+    after = State(started=started, touching=touching, side=state.side, last=here, anchor=anchor)
     return after, rest, made, place
 
 

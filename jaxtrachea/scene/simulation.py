@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea._in_order import one_kernel
 from jaxtrachea._numerics import full_precision
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.oblique import Place, press_at
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import Approach, approach
@@ -89,7 +89,7 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
 
     The rows of a path with `contact_point` fixed belong together: the tool stays on the place that
-    it touched first. A row that needs what the plan has not (`ranges.unserved`) is NaN with
+    it touched first. A row that needs what the plan has not (`ranges.outside_plan`) is NaN with
     OFF_PLAN; one whose contact lies beyond an end of the tube or behind the ends of its rings with
     OFF_TUBE or BEHIND_GAP, one of a tool in the lumen with IN_LUMEN; a negative stiffness or
     coefficient of friction is NaN with BAD_MATERIAL in every row. What the user or a tolerance left
@@ -166,7 +166,7 @@ def pressed(
         moved = moved_by(press_at(place, used.displacement, plan.options), plan)
     else:
         solve = vectors if plan.second_plane else one_plane
-        moved = one_kernel(lambda used: solve(scene, material, used))(used)
+        moved = fuse(lambda used: solve(scene, material, used))(used)
     force, moment, solved = moved.force, None, moved.status
     of_joints = isinstance(material, Material)
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:

@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_word, real, shaped
 from jaxtrachea._errors import InputError
-from jaxtrachea._in_order import one_kernel
 from jaxtrachea.contact.patches import Patches, Touch, touch
 from jaxtrachea.contact.pose import Pose, check_rotations
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.admission import check_shapes
 from jaxtrachea.mechanics.sections.material import SectionMaterial, check_sections
 from jaxtrachea.mechanics.sections.wall import Points
@@ -188,7 +188,7 @@ def _touch_rows(tool: Shape, tube: Patches, path: Poses, quality: Settings, near
     def one(R, T):
         return touch(tool, Pose(R, T), tube, quality, near=near)
 
-    return jax.vmap(one_kernel(one))(path.rotation, path.translation)
+    return jax.vmap(fuse(one))(path.rotation, path.translation)
 
 
 def at_row(v, row):

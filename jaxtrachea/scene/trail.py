@@ -26,7 +26,7 @@ CANDIDATES, LEAST_SHARE = 64, 0.3
 #: Newton steps for the scale; the distance along a straight way is convex.
 STEPS = 3
 #: Largest scale: the surface moves less and less as the dent does (`friction.toml` needs 1.3).
-MOST = 5.0
+MAX_SCALE = 5.0
 
 
 def slid(
@@ -63,8 +63,8 @@ def touching(
 ) -> Float[Array, "vertices 3"]:
     """The dented surface with its dent scaled (by 0 at least) until it touches the tool.
 
-    By `MOST` at most, so that the surface is continuous where the dent goes to 0: a tool that lies
-    further inside of the sunk surface than that stays in it.
+    By `MAX_SCALE` at most, so that the surface is continuous where the dent goes to 0: a tool that
+    lies further inside of the sunk surface than that stays in it.
 
     Args:
         tool: -
@@ -96,7 +96,7 @@ def touching(
         needed = jnp.max(jnp.where(counts, needed, -jnp.inf))
         return jnp.where(jnp.isfinite(needed), jnp.maximum(needed, 0), scale)
 
-    scale = jnp.minimum(jax.lax.fori_loop(0, STEPS, newton, jnp.ones_like(peak)), MOST)
+    scale = jnp.minimum(jax.lax.fori_loop(0, STEPS, newton, jnp.ones_like(peak)), MAX_SCALE)
     return sunk + scale * (dented - sunk)
 
 

@@ -15,7 +15,7 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
 
 #: Patches of the tube searched for a contact with a tool shorter than one of them.
-NEAR = 2
+MIN_STATIONS = 2
 #: Length of a tool over the radius of the tube from which on a contact takes more steps.
 LONG = 8
 #: Patches of a mesh: their rounding, and corners of each (docs/simulate.md says what that loses).
@@ -79,7 +79,7 @@ def patches_of_wall(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
 
 def near_patches(tool: Shape, geometry: Geometry, count: int) -> int:
     """As many patches as the tool can lie along, and one more."""
-    return min(NEAR + int(_longest(tool) * count / float(geometry.length)), count)
+    return min(MIN_STATIONS + int(_longest(tool) * count / float(geometry.length)), count)
 
 
 def contact_settings(tool: Shape, geometry: Geometry) -> Settings:

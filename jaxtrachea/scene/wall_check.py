@@ -28,7 +28,7 @@ OVERLAP, OVERLAP_SHARE = 0.5, 0.15
 #: Least limit of the worst, as a share of the radius: meshes are made of facets.
 LEAST_LIMIT = 0.02
 #: Patches that are searched for each.
-NEAR = 4
+NEAREST = 4
 #: Classes of triangles by size, each half of the next; points that are searched together.
 SIZES, CHUNK = 12, 100
 #: Width of a triangle over its length, below which roundings say where its normal points.
@@ -282,7 +282,7 @@ def _sharp_gap(patches: Patches, points):
     depth = [(points @ h.equations[:, :3].T + h.equations[:, 3]).max(axis=1) for h in hulls]
     bounds = np.stack(depth, axis=1) - radius  # exact inside a core, else a lower bound
     found, nearest = np.full(len(points), np.inf), np.zeros(len(points), int)
-    for rank in np.argsort(bounds, axis=1)[:, :NEAR].T:
+    for rank in np.argsort(bounds, axis=1)[:, :NEAREST].T:
         for i in np.unique(rank):
             rows = np.flatnonzero(rank == i)
             inside = depth[i][rows] <= 0

@@ -43,7 +43,7 @@ class _Programs:
     neighbour.
     """
 
-    def __init__(self, case: Case, dtype: str, *, quick: bool = False):
+    def __init__(self, case: Case, dtype: str, *, unoptimised: bool = False):
         """Compile for the shapes of `case`."""
         call, self.dtype, self.constant = FUNCTIONS[case.function], dtype, case.constant
         healthy = self.arrays(case.healthy)
@@ -56,7 +56,7 @@ class _Programs:
         self.healthy = healthy
         one, many = (functools.partial(f, call, case.constant) for f in (_alone, _lane))
         first = {n: v[0] for n, v in basis[1].items()}
-        options = quick_options() if quick else None
+        options = quick_options() if unoptimised else None
         self.one = jax.jit(one).lower(healthy, first).compile(options)
         self.many = jax.jit(jax.vmap(many)).lower(self.batch(healthy), *basis).compile(options)
 
@@ -126,7 +126,7 @@ def _basis(shapes, lanes: int, dtype: str):
 
 
 def run_table(
-    cases: list[Case], truths: dict[str, Truth], dtypes, *, quick: bool = False
+    cases: list[Case], truths: dict[str, Truth], dtypes, *, unoptimised: bool = False
 ) -> Iterator[Outcome]:
     """Run all cases; outcomes come in the order of the table, function by function.
 
@@ -134,7 +134,7 @@ def run_table(
         cases: rows of the table.
         truths: by name.
         dtypes: some of `table.DTYPES`.
-        quick: compile without optimisation: not the programs that are otherwise run.
+        unoptimised: compile without optimisation: not the programs that are otherwise run.
     """
     groups: dict[tuple[str, str], list[Case]] = {}
     for case in cases:
@@ -143,7 +143,7 @@ def run_table(
                 groups.setdefault((case.function, dtype), []).append(case)
     with ThreadPoolExecutor(usable_cores()) as pool:
         made = {
-            key: pool.submit(_Programs, rows[0], key[1], quick=quick)
+            key: pool.submit(_Programs, rows[0], key[1], unoptimised=unoptimised)
             for key, rows in groups.items()
         }
         for key, rows in groups.items():

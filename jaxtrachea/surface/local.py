@@ -24,9 +24,9 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._linear import linear
 from jaxtrachea._numerics import added, epsilon, total
+from jaxtrachea.fusion import fuse, in_order
 
 #: Centres on circles round C, by the number of centres; the outermost circle is the collar.
 CIRCLES = {1: (), 8: (7,), 16: (6, 9), 32: (6, 10, 15)}
@@ -309,7 +309,7 @@ def add_correction(
         return start, whole, run.T
 
     # By itself: of vertices that begin anywhere the processor would take one after the other.
-    start, whole, run = one_kernel(find)(s_c, dent.reach)
+    start, whole, run = fuse(find)(s_c, dent.reach)
     here = _columns(dent, run.T)
     rest = points.shape[0] - length
 

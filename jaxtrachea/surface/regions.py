@@ -30,9 +30,9 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._linear import linear, replaced
 from jaxtrachea._numerics import added, epsilon, total
+from jaxtrachea.fusion import fuse, in_order
 from jaxtrachea.surface import phong
 from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
 from jaxtrachea.trachea.geometry import Geometry
@@ -190,7 +190,7 @@ def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
     def share(*given):
         return jnp.stack(_shares(*given))
 
-    return Weights(one_kernel(share)(binding.phi, phi_c, binding.half_angle), phi_c)
+    return Weights(fuse(share)(binding.phi, phi_c, binding.half_angle), phi_c)
 
 
 @jax.custom_jvp
@@ -293,7 +293,7 @@ def _carry(binding: Binding, weights: Weights, s_c, joints, contact, U, V, slope
         shares = weights.U, weights.J, weights.V
         return _combine(shares, binding.fraction, binding.s, beyond, rows)
 
-    patches = one_kernel(lines)(s_c, joints, contact, U, V, slopes)
+    patches = fuse(lines)(s_c, joints, contact, U, V, slopes)
     return in_order(across)(weights, s_c, patches)
 
 

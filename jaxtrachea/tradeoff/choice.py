@@ -4,9 +4,9 @@ Every effect is dropped alone from the full program, the rung of the fewest oper
 tolerance is taken (where time is the cost, if it surely saves some), and all of them together are
 checked.
 Effects do not add up: while the whole is too far off, the effect that errs most per cost saved
-comes back by one rung. Cost (`price.By`) is operations, so that the choice does not depend on the
-machine, or the time measured on this one; errors are those of force, joints and surface over the
-path and two sample paths beside it.
+comes back by one rung. Cost (`price.Objective`) is operations, so that the choice does not depend
+on the machine, or the time measured on this one; errors are those of force, joints and surface over
+the path and two sample paths beside it.
 """
 
 import dataclasses
@@ -17,14 +17,14 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.scene.plan import Decision, Served
+from jaxtrachea.scene.plan import Decision, ValidRange
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program
-from jaxtrachea.tradeoff.price import GRAIN, By, Cost, words
+from jaxtrachea.tradeoff.price import MIN_SAVING, Cost, Objective, words
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -58,8 +58,8 @@ class Choice(NamedTuple):
         tolerance: relative.
         dropped: effects at a lower level than in the full program.
         refused: rungs that are too far off alone.
-        returned: rungs that were within the tolerance alone, but not together with the others.
-        idle: rungs within the tolerance that do not surely save time, alone or with the others.
+        restored: rungs that were within the tolerance alone, but not together with the others.
+        no_gain: rungs within the tolerance that do not surely save time, alone or with the others.
         errors: of the choice against the full program, on all sample paths.
         cost: of the full program and of the choice against it: s, or operations for the path.
         by: what was made least.
@@ -75,18 +75,18 @@ class Choice(NamedTuple):
     tolerance: float
     dropped: tuple[Rung, ...]
     refused: tuple[Rung, ...]
-    returned: tuple[Rung, ...]
-    idle: tuple[Rung, ...]
+    restored: tuple[Rung, ...]
+    no_gain: tuple[Rung, ...]
     errors: Errors
     cost: Cost
-    by: By
+    by: Objective
     operations: float
     others: float
 
     @property
     def sentence(self) -> str:
         """What was found, in a line."""
-        if not self.dropped and self.idle:
+        if not self.dropped and self.no_gain:
             within = percent(self.tolerance)
             return f"nothing that is within {within} surely saves time; the full program is taken"
         if not self.dropped:
@@ -99,7 +99,7 @@ class Choice(NamedTuple):
 
 def choose(
     full: Full | Trial, tolerance: float, report: Callable[[str], None] = lambda text: None,
-    *, precision: Literal["auto", "float64"] = "auto", by: By = "operations",
+    *, precision: Literal["auto", "float64"] = "auto", by: Objective = "operations",
 ) -> Choice:  # fmt: skip
     """Choose the cheapest levels within the tolerance.
 
@@ -115,7 +115,7 @@ def choose(
         ValueError: another word for `precision` or `by`.
     """
     check_word("precision", precision, Literal["auto", "float64"])
-    check_word("by", by, By)
+    check_word("by", by, Objective)
     trial = full if isinstance(full, Trial) else Trial(full, report)
     full = trial.full
     every = _ladders(full, precision)
@@ -135,16 +135,16 @@ def choose(
             break
         if errors.worst > tolerance:
             back = max(picked, key=lambda r: r.errors.worst / r.saved)
-            found.returned.append(back)
+            found.restored.append(back)
             finer = _within(trial, by, named[back.ladder], tolerance, found, back)
             if finer is None:
                 del options[back.ladder]
             else:
                 options[back.ladder].append(finer)
-        elif by != "operations" and trial.cost(by, levels).saved < GRAIN:
+        elif by != "operations" and trial.cost(by, levels).saved < MIN_SAVING:
             # What saves time alone need not do so with the others.
             least = min(picked, key=lambda r: r.saved)
-            found.idle.append(least)
+            found.no_gain.append(least)
             del options[least.ladder]
         else:
             break
@@ -155,8 +155,8 @@ def choose(
     return Choice(
         scene=scene, material=material, path=path, levels=levels, changed=changed,
         tolerance=tolerance,
-        dropped=tuple(picked), refused=tuple(found.refused), returned=tuple(found.returned),
-        idle=tuple(found.idle), errors=errors,
+        dropped=tuple(picked), refused=tuple(found.refused), restored=tuple(found.restored),
+        no_gain=tuple(found.no_gain), errors=errors,
         cost=trial.cost(by, levels), by=by,
         operations=trial.share(by, levels),
         others=trial.others,
@@ -192,12 +192,12 @@ class _Found(NamedTuple):
     """Rungs that were tried and not taken; see `Choice`."""
 
     refused: list[Rung]
-    returned: list[Rung]
-    idle: list[Rung]
+    restored: list[Rung]
+    no_gain: list[Rung]
 
 
 def _within(
-    trial: Trial, by: By, ladder: Ladder, tolerance: float, found: _Found,
+    trial: Trial, by: Objective, ladder: Ladder, tolerance: float, found: _Found,
     above: Rung | None = None,
 ) -> Rung | None:  # fmt: skip
     """The rung of the fewest operations that is within the tolerance alone and saves time.
@@ -225,9 +225,9 @@ def _within(
                 return best
             trial.report(f"{ladder.name} {best.level}: time")
             saved = trial.cost(by, levels[best.level]).saved
-            if saved >= GRAIN:
+            if saved >= MIN_SAVING:
                 return best._replace(saved=saved)
-            found.idle.append(best)
+            found.no_gain.append(best)
         elif above is None:
             found.refused.extend(rungs)
     return None
@@ -241,7 +241,7 @@ def _combined(named: dict[str, Ladder], picked: list[Rung]) -> dict[str, Any]:
     return changed
 
 
-def _served(reference: Simulation) -> Served:
+def _served(reference: Simulation) -> ValidRange:
     """What the sample paths press, all of them together."""
     D, phi = reference.displacement, reference.phi
     inward = -np.cos(phi) * D[..., 1] - np.sin(phi) * D[..., 2]
@@ -252,7 +252,7 @@ def _served(reference: Simulation) -> Served:
         return float(np.abs(v[on]).max())
 
     s = float(reference.s[on].min()), float(reference.s[on].max())
-    return Served(
+    return ValidRange(
         s=s, angle=most(phi), along=most(D[..., 0]), across=most(across), inward=most(inward)
     )
 
@@ -263,8 +263,8 @@ def _explained(scene: Scene, picked: list[Rung], found: _Found) -> Scene:
     for rungs, form in (
         (picked, "within the tolerance: changes {1}"),
         (found.refused, "{0} would change {1}"),
-        (found.returned, "{0} would change {1}, too much together with the others"),
-        (found.idle, "{0} would change {1} and not surely save time"),
+        (found.restored, "{0} would change {1}, too much together with the others"),
+        (found.no_gain, "{0} would change {1} and not surely save time"),
     ):
         for rung in rungs:
             said.setdefault(rung.effect, []).append(form.format(rung.level, changes(rung.errors)))

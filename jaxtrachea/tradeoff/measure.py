@@ -177,7 +177,7 @@ def choice_row(name: str, choice: Choice, repeat: Cost, end: dict[str, Any]) -> 
     return {
         "scene": name, "tolerance": choice.tolerance, "by": choice.by,
         "dropped": said(choice.dropped), "refused": said(choice.refused),
-        "returned": said(choice.returned), "idle": said(choice.idle),
+        "returned": said(choice.restored), "idle": said(choice.no_gain),
         "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
         "cost": short(choice.cost), "operations": round(choice.operations, 4),
         "repeat": short(repeat),

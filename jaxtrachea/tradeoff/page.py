@@ -135,7 +135,7 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     for row in rows:
         error, repeat = row["errors"], row["repeat"]
         worst = max(v for k in ("force", "joints", "surface") if (v := error[k]) is not None)
-        dropped, returned = (
+        dropped, restored = (
             ", ".join(f"{d['ladder']} {d['level']} ({_percent(d['error'])})" for d in row[k])
             for k in ("dropped", "returned")
         )
@@ -143,7 +143,7 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
         over = repeat["share"] / row["operations"]
         cells = [
             row["scene"], f"{100 * row['tolerance']:g} %", row["by"],
-            dropped or "nothing", returned or "-",
+            dropped or "nothing", restored or "-",
             f"{100 * worst:.2g} %", _range(row["cost"]), f"{100 * row['operations']:.0f} %",
             _range(repeat),
             f"{_micro(repeat['full'] * repeat['share'])} / {_micro(repeat['full'])}",

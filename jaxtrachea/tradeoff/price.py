@@ -14,13 +14,13 @@ from jaxtrachea.tradeoff.calls import Arguments, Call, last_row, one_pose, whole
 
 #: What is made least: time of the whole path in one call (`simulate`), of a pose a call
 #: (`Session`), or operations, those in float32 counted half: the same on every machine.
-By = Literal["path", "step", "operations"]
+Objective = Literal["path", "step", "operations"]
 #: Those that are a time.
 Time = Literal["path", "step"]
 #: What an operation in float32 counts where operations are the cost.
 HALF = 0.5
 #: Share of the time below which it is not worth an error to save it.
-GRAIN = 0.02
+MIN_SAVING = 0.02
 #: A time in words.
 WORDS: dict[Time, str] = {"path": "the whole path in one call", "step": "one pose a call"}
 
@@ -91,13 +91,13 @@ def compiled(by: Time, arguments: Arguments) -> Call:
     return {"path": whole_path, "step": one_pose}[by](arguments)
 
 
-def words(by: By, cost: Cost) -> str:
+def words(by: Objective, cost: Cost) -> str:
     """What the other program costs, in words.
 
     Raises:
         ValueError: another word.
     """
-    check_word("by", by, By)
+    check_word("by", by, Objective)
     share, low, high = (f"{100 * v:.0f}" for v in (cost.share, cost.low, cost.high))
     if by == "operations":
         return f"{share} % of its cost"

@@ -16,7 +16,7 @@ from jaxtrachea.tradeoff.calls import Call, turn_medians
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.price import By, Cost, compiled, operations
+from jaxtrachea.tradeoff.price import Cost, Objective, compiled, operations
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
@@ -40,8 +40,8 @@ class Trial:
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}
         self.counts: dict[tuple[bool, Levels], float] = {}
-        self.times: dict[tuple[By, Levels], Cost] = {}
-        self.calls: dict[By, Call] = {}
+        self.times: dict[tuple[Objective, Levels], Cost] = {}
+        self.calls: dict[Objective, Call] = {}
         #: Most cores that others kept busy while times were measured.
         self.others = 0.0
         report("full program")
@@ -63,7 +63,7 @@ class Trial:
             self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
         return self.known[levels]
 
-    def share(self, by: By, levels: Levels) -> float:
+    def share(self, by: Objective, levels: Levels) -> float:
         """Of the full program's operations; for `step` of the last row alone."""
         step = by == "step"
         return self._operations(levels, step=step) / self._operations(self.full.levels, step=step)
@@ -74,7 +74,7 @@ class Trial:
             self.counts[step, levels] = operations(program(self.full, levels), step=step)
         return self.counts[step, levels]
 
-    def cost(self, by: By, levels: Levels) -> Cost:
+    def cost(self, by: Objective, levels: Levels) -> Cost:
         """Of the full program and of these levels: s, measured in turns, or operations."""
         full = self.full.levels
         if by == "operations":

@@ -50,7 +50,7 @@ def main() -> None:
     out = common.Writer("cohort", "scipy", "lmfit")
     study, model, forces = fitting.make_study(SPECIMENS, SPOTS, DEPTHS)
     few = forces[:SAMPLE]
-    errors = Settings(starts=1, scrutiny=False)
+    errors = Settings(starts=1, verify=False)
     cases = {
         "jaxtrachea: fit with standard errors": lambda: fit.fit(study, errors),
         "jaxtrachea: fit, what is in doubt profiled": lambda: fit.fit(study, Settings(starts=1)),

@@ -220,7 +220,7 @@ def main() -> None:
     study = cohort(told.specimens)
     for most, single in ROUNDS:
         batch = study.batch_size(told.specimens, most)
-        settings = Settings(starts=1, scrutiny=False, batch=most, float32=single)
+        settings = Settings(starts=1, verify=False, batch=most, float32=single)
         speed, medians = fits(study, settings)
         dtype = "float32" if single else "float64"
         print(f"| {device.device_kind}, {dtype} | {batch:,} | {speed} | {medians} |", flush=True)

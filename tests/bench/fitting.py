@@ -272,7 +272,7 @@ def main() -> None:
     first = {}
 
     def ours():
-        return fit.fit(study, dataclasses.replace(settings, scrutiny=False))
+        return fit.fit(study, dataclasses.replace(settings, verify=False))
 
     def scrutinised():
         return fit.fit(study, settings)

@@ -99,13 +99,13 @@ def pipeline(out: common.Writer) -> None:
             check(cases)
             if lanes > 1:
                 for name in list(cases)[:2]:
-                    cases[f"{name}, one at a time"] = wait(in_turn(programs[name]), *args)
+                    cases[f"{name}, one at a time"] = wait(map_sequentially(programs[name]), *args)
             found = common.interleaved(cases, rounds=25, target=0.02)
             out.table("pipeline", found, lanes=lanes, dtype=dtype, walls=walls)
             out.write()
 
 
-def in_turn(program):
+def map_sequentially(program):
     """The program for many lanes, one after the other in one call."""
     return lambda *args: jax.lax.map(lambda x: program(*x), args)
 

@@ -141,7 +141,7 @@ def section_study(phi: float, specimens: int):
 
 def fits_per_second(study, specimens: int) -> tuple[float, int]:
     """Of a second, compiled run; and how many have an estimate."""
-    settings = Settings(starts=1, more_starts=0, scrutiny=False)
+    settings = Settings(starts=1, more_starts=0, verify=False)
     fit(study, settings)
     start = time.perf_counter()
     result = fit(study, settings)

@@ -19,7 +19,7 @@ from jaxtrachea import (
     ObliqueOptions,
     Options,
     deflect,
-    one_kernel,
+    fuse,
     press,
     press_oblique,
 )
@@ -82,7 +82,7 @@ def main() -> None:
         lanes = s + jnp.linspace(-3, 3, LANES)
         row = []
         timed, spent = {}, {}
-        for kind, f in (("plain", plain), ("one", one_kernel(plain))):
+        for kind, f in (("plain", plain), ("one", fuse(plain))):
             slope = jax.value_and_grad(f, (0, 1))
             timed["value", kind], _ = ready(f, s, material)
             timed["gradient", kind], spent[kind] = ready(slope, s, material)

@@ -129,7 +129,7 @@ def fits() -> dict[str, Case]:
     """A batch with standard errors against solvers that take one specimen at a time."""
     study, model, forces = fitting.make_study(SPECIMENS)
     fitting.check(study, model, forces)
-    settings = Settings(starts=1, scrutiny=False)
+    settings = Settings(starts=1, verify=False)
     solvers = {
         "scipy least_squares lm": lambda i: fitting.with_scipy(model.value, model.jacobian),
         "lmfit leastsq": lambda i: fitting.with_lmfit(model),

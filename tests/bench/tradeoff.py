@@ -35,7 +35,7 @@ SCENES = {
 }
 DATA = {"virtual_trachea": "fits/virtual_trachea/fit.toml"}
 TOLERANCES = (0.5, 0.1, 0.01, 0.001)
-#: What is made least: see `price.By`.
+#: What is made least: see `price.Objective`.
 LEAST = ("path", "step")
 
 

@@ -20,7 +20,7 @@ import jaxtrachea
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.core import Estimate, predicted
@@ -74,7 +74,7 @@ def test_residuals_and_bands_of_unequal_noise(free, tmp_path):
     options = Options(contact="bonded", shear=True)
     changes = held | {"k_1": {} if free else {"fixed": True, "value": 2.0}}
     result = fit(build_study(weighed, table_1(), options, changes, noise=noise), TWO)
-    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
     read = jaxtrachea.read_results(tmp_path / "r.h5")
     off, aside = [], []
     for curve in measured:
@@ -220,7 +220,7 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     force = truth + NOISE * rng.normal(size=(1, 1, len(DEPTHS)))
     curves = synthetic.curves(force, np.array([75.0]), DEPTHS)
     result = fit(build_study(curves, table_1(), synthetic.OPTIONS, synthetic.parameters()), TWO)
-    write_hdf5(tmp_path / "results.h5", Findings(result), {"inputs": {"a.csv": "0" * 64}})
+    write_hdf5(tmp_path / "results.h5", AnalysisResults(result), {"inputs": {"a.csv": "0" * 64}})
     read = jaxtrachea.read_results(tmp_path)
     source = source_of(read, pressed(read).specimens[0])
     # EI_L on its upper bound: k_M is a direction by itself, whose slope is 1e-8 of the others'.

@@ -21,8 +21,8 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.fitting.tested import deeper_than_tested, depths
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.fitting.validated_depth import deeper_than_validated, depths
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.measurements.read import Curve
@@ -30,7 +30,7 @@ from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.predict import predict_sources
-from jaxtrachea.prediction.sources import Source, source_of
+from jaxtrachea.prediction.sources import CurveParameters, source_of
 from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.rows import lane_rows
@@ -153,7 +153,7 @@ def test_fixed_specification_is_evaluated(tmp_path):
     row = next(lane_rows(result))
     assert "nothing was fitted" in str(row["message"])
     assert "nothing was fitted" in verdict_sentence(result, 0)
-    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
     read = jaxtrachea.read_results(tmp_path / "r.h5")
     curve = jaxtrachea.predict(read, s=80.0, displacement=1.0, specimen="T1")
     assert curve.se == 0
@@ -239,7 +239,7 @@ def test_rows_where_the_wall_moves_further_than_the_radius_are_told():
 
 def source_like(status):
     none = np.zeros((0, 0))
-    return Source(
+    return CurveParameters(
         "a", "", 0, none[0:], none[0:], none, none, np.array(2.0), np.ones(2), (), status, ""
     )
 
@@ -261,8 +261,8 @@ def late_study(onset, offset, late=(10.0, 10.3), zero=0.0):
 def test_extrapolated_and_tested_are_depths_from_first_touch(onset, tmp_path):
     """Presses of 1 mm, recorded from 8 to 11 mm; what was said was held against these 11 mm."""
     late = (10.0, 10.0 if onset else 10.3)
-    result = fit(late_study(onset, {}, late), Settings(starts=1, scrutiny=False))
-    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    result = fit(late_study(onset, {}, late), Settings(starts=1, verify=False))
+    write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
     beyond = "extrapolated from data at D = 0 to 1 mm from first touch"
     for results in (result, jaxtrachea.read_results(tmp_path / "r.h5")):
 
@@ -367,10 +367,10 @@ def test_change_points_serve_before_a_fit_and_numbers_that_are_held_as_they_are(
 def test_curves_are_as_deep_as_they_press():
     """Records to 13 mm that touch at 10.0 and 12.2 mm: one goes 3 mm deep, one 0.8."""
     curves = [Curve("a", "", 50.0, 0.0, np.linspace(8, 13, 5), np.ones(5))] * 2
-    says = deeper_than_tested(curves, Options(), 12.0, [10.0, 12.2], " from first touch")
+    says = deeper_than_validated(curves, Options(), 12.0, [10.0, 12.2], " from first touch")
     assert says is not None
     assert says.startswith("1 of 2 curves go to 3 mm from first touch; skeleton = 'linear' was")
-    assert deeper_than_tested(curves, Options(skeleton="softening"), 12.0, [10.0, 12.2]) is None
+    assert deeper_than_validated(curves, Options(skeleton="softening"), 12.0, [10.0, 12.2]) is None
 
 
 @pytest.mark.parametrize(
@@ -386,5 +386,5 @@ def test_curves_are_as_deep_as_they_press():
 )
 def test_curves_deeper_than_a_skeleton_was_tested(options, depths, says):
     curves = [Curve("a", "", 50.0, 0.0, d * np.linspace(0, 1, 5), np.ones(5)) for d in depths]
-    sentence = deeper_than_tested(curves, options, 12.0)
+    sentence = deeper_than_validated(curves, options, 12.0)
     assert sentence is None if says is None else re.search(says, sentence)

@@ -9,7 +9,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.results.hdf5 import write_hdf5
@@ -40,11 +40,11 @@ def total_study(curves, more=None, **settings):
 
 
 #: Always two lanes at once, so that one program serves.
-TWO = Settings(starts=1, batch=2, scrutiny=False)
+TWO = Settings(starts=1, batch=2, verify=False)
 
 
 def stored_again(study, path):
     """A fit of a study, written and read."""
     result = fit(study, TWO)
-    write_hdf5(path, Findings(result), {})
+    write_hdf5(path, AnalysisResults(result), {})
     return jaxtrachea.read_results(path)

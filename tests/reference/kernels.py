@@ -31,7 +31,7 @@ def count_kernels(text: str | None, *, inside: bool = True) -> tuple[int, int]:
 
     Args:
         text: `as_text()` of the compiled program.
-        inside: what would be a kernel in a part that is compiled as one (`_in_order.one_kernel`)
+        inside: what would be a kernel in a part that is compiled as one (`fusion.fuse`)
             counts: a measure of the work, since it takes about as long. Else that part counts once.
 
     Raises:

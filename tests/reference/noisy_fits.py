@@ -7,7 +7,7 @@ import synthetic
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.trachea.geometry import table_1
 
@@ -44,7 +44,7 @@ def noisy_study(folder, noise, lanes, seed):
     curves = synthetic.curves(force, np.array(SEEN), DEPTHS)
     table = synthetic.parameters(**changes)
     result = fit(
-        build_study(curves, table_1(), synthetic.OPTIONS, table), Settings(starts=1, scrutiny=False)
+        build_study(curves, table_1(), synthetic.OPTIONS, table), Settings(starts=1, verify=False)
     )
-    write_hdf5(folder / "results.h5", Findings(result), {"inputs": {"a.csv": "0" * 64}})
+    write_hdf5(folder / "results.h5", AnalysisResults(result), {"inputs": {"a.csv": "0" * 64}})
     return result

@@ -20,9 +20,9 @@ from jaxtrachea import (
     press_path,
     simulate,
 )
-from jaxtrachea._in_order import one_kernel
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
@@ -53,7 +53,7 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
             at = used.s[0], used.phi[0]
             return press_oblique(scene.geometry, m, *at, used.displacement, oblique)
 
-        out = one_kernel(pressed)(used)
+        out = fuse(pressed)(used)
         vertices = move_surface(scene, *at, out, surface) if surface else ()
         named = {name: getattr(out, name) for name in ("force", "depth", "skeleton", *more.split())}
         named, vertices = hidden((named, vertices))
@@ -123,7 +123,7 @@ def friction(scene, m, p):
 
 def each(scene, m, p):
     m, led, used, status, hidden = admitted(scene, m, p)
-    out = one_kernel(lambda used: oblique_presses(scene, m, used))(used)
+    out = fuse(lambda used: oblique_presses(scene, m, used))(used)
     seen = hidden({name: getattr(out, name) for name in SEEN})
     return led, seen, status(out._replace(**seen))
 
@@ -150,7 +150,7 @@ def tool(scene, m, p):
     def pressed(p):
         # As `simulate` does, here and below: across the border of a computation XLA finds nothing
         # that is there twice.
-        seen = jax.vmap(one_kernel(contact))(p.rotation, p.translation)
+        seen = jax.vmap(fuse(contact))(p.rotation, p.translation)
         inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
         return Presses(seen.s, seen.phi, -seen.gap[:, None] * inward), (seen, inward)
 
@@ -158,7 +158,7 @@ def tool(scene, m, p):
     inside = in_lumen(scene, p, seen)
     made = Approach(seen, presses, inward, None, None, seen, inside)
     m, led, used, status, hidden = admitted(scene, m, None, made)
-    out = one_kernel(lambda used: oblique_presses(scene, m, used))(used)
+    out = fuse(lambda used: oblique_presses(scene, m, used))(used)
     wrench = force_and_moment(p, pull, inward, used, out)
     # A row is OK only with a force and a moment that are finite.
     finite = jnp.isfinite(jnp.sum(wrench[0] + wrench[1], axis=1))
@@ -343,5 +343,5 @@ def test_counting_operations():
     assert 140 <= count_operations(loop, x) <= 140 + 14
     assert count_operations(jax.jit(lambda x: (jnp.sin(x), jnp.cos(x))), x) == 40
     # Going back, a part is a call of its own: it counts with what is in it.
-    wave = one_kernel(lambda x: jnp.sin(jnp.cos(jnp.sin(x))))
+    wave = fuse(lambda x: jnp.sin(jnp.cos(jnp.sin(x))))
     assert count_operations(jax.grad(lambda x: jnp.sum(wave(x))), x) >= 5 * 20

@@ -32,8 +32,8 @@ from jaxtrachea.scene.assemble import with_mesh
 from jaxtrachea.scene.build import dropped_effects
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.lumen import off_the_end
-from jaxtrachea.scene.plan import Served
-from jaxtrachea.scene.ranges import depth_share, lacking, unserved
+from jaxtrachea.scene.plan import ValidRange
+from jaxtrachea.scene.ranges import depth_share, lacking, outside_plan
 from jaxtrachea.scene.refusals import status_of, without_negative_values
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
@@ -53,7 +53,7 @@ VECTORS = dataclasses.replace(ONE, second_plane="on")
 def needing_more(scene, material, presses):
     """Rows that press and are off the plan."""
     pressing = jnp.ones(len(presses.s), bool)
-    asked = jax.jit(unserved)(scene, material, presses, pressing)
+    asked = jax.jit(outside_plan)(scene, material, presses, pressing)
     return [0] * len(presses.s) if asked is None else np.asarray(asked).astype(int).tolist()
 
 
@@ -159,7 +159,7 @@ def test_a_plan_of_the_midline_bends_its_rings_off_it():
 
 def test_a_plan_of_a_tolerance_serves_what_it_was_measured_for():
     """Rings as springs, right within 1 % at the place measured, are nowhere near it elsewhere."""
-    served = Served((70.0, 80.0), angle=0.1, along=0.0, across=0.0, inward=3.0)
+    served = ValidRange((70.0, 80.0), angle=0.1, along=0.0, across=0.0, inward=3.0)
     path = Presses(
         [75.0, 75, 75, 75, 90], [0.0, 0.5, 0.0, 0.0, 0.0],
         [[0, -3.0, 0], [0, -2, -1], [1, -3, 0], [0, -4, 0], [0, -3, 0]],

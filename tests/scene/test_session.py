@@ -28,7 +28,7 @@ from jaxtrachea import EffectOptions, Poses, Session, make_scene, press, press_o
 from jaxtrachea.contact.shapes import capsule, sphere
 from jaxtrachea.mechanics.oblique import ObliqueOptions, place_at
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene.seat import given_way
+from jaxtrachea.scene.anchor import yielded
 from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
 
@@ -289,7 +289,7 @@ def test_what_gives_way_only_loses_energy(held):
         place = place_at(TUBE, stiff, 72.0, 1.0, ObliqueOptions(scene.plan.options))
 
         def one(way):
-            return given_way(scene, way, jnp.asarray(2.0), place)
+            return yielded(scene, way, jnp.asarray(2.0), place)
 
         once = jax.vmap(one)(ways)
         return once, jax.vmap(one)(once), place.unit.compliance

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sections_linear import E, beam_shares, span_stiffness, wall_matrices
 
-from jaxtrachea._in_order import one_kernel
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.sections import block
 from jaxtrachea.mechanics.sections.contact import effective_place, place_on
 from jaxtrachea.mechanics.sections.section import Shape, make_grid
@@ -71,7 +71,7 @@ def test_block_elimination_is_dense(m, alone, indefinite, n):
         factors = block.factor(D, U)
         return block.solve(factors, rhs), factors.negative
 
-    both = one_kernel(plain, products=True) if alone else plain
+    both = fuse(plain, products=True) if alone else plain
 
     one = jax.jit(both)(*map(jnp.asarray, (D, U, rhs)))
     scaled = (jnp.stack([v / 2, v, 4 * v]) for v in (D, U))

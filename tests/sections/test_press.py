@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sections_linear import linear_force
 
-from jaxtrachea import _in_order
+from jaxtrachea import fusion
 from jaxtrachea.mechanics import press as mat
 from jaxtrachea.mechanics.sections import press as press_module
 from jaxtrachea.mechanics.sections import system
@@ -284,7 +284,7 @@ def test_an_equilibrium_that_is_no_minimum_is_seen():
 @pytest.mark.parametrize(("midline", "kernels"), [(True, 3), (False, 2)])
 def test_single_kernels_of_a_step(midline, kernels):
     """Closure and solution, on the midline assembly with elimination; of many lanes none."""
-    if _in_order._one_kernel_p is None:
+    if fusion._one_kernel_p is None:
         pytest.skip("this jaxlib makes no single kernels")
     geometry, material = Geometry.create(30.0, [10.0, 20.0]), SectionMaterial(**VALUES)
     direction = jnp.asarray([1.0, 0.0])

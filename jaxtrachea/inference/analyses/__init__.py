@@ -8,7 +8,7 @@ from jaxtrachea.config import SpecError
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analyses.misfit import MISFIT
-from jaxtrachea.inference.analysis import Analysis, Findings, Progress, Request, Unavailable
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Progress, Request, Unavailable
 
 
 def in_order(analyses: Iterable[Analysis]) -> tuple[Analysis, ...]:
@@ -81,7 +81,7 @@ def left_out(request: Request) -> list[str]:
 
 def analyse(
     request: Request, result: FitResult, begin: Callable[[str], Progress] | None = None
-) -> Findings:
+) -> AnalysisResults:
     """Do all analyses of a fit that are asked for.
 
     Args:
@@ -89,7 +89,7 @@ def analyse(
         result: the fit.
         begin: called with what is done next; returns whom to tell of its progress.
     """
-    findings = Findings(result)
+    findings = AnalysisResults(result)
     for analysis in ANALYSES:
         if not analysis.wanted(request):
             continue
@@ -99,10 +99,10 @@ def analyse(
             found = (*found, (analysis, analysis.compute(request, findings, progress)))
         except Unavailable as error:
             unavailable[analysis.name] = str(error)
-        findings = Findings(result, found, unavailable)
+        findings = AnalysisResults(result, found, unavailable)
     return findings
 
 
-def widened(result: FitResult) -> Findings:
+def widened(result: FitResult) -> AnalysisResults:
     """A fit with the analyses that every table of lanes has, and no others."""
-    return Findings(result, ((EFFECTIVE, Findings(result)), (MISFIT, result)))
+    return AnalysisResults(result, ((EFFECTIVE, AnalysisResults(result)), (MISFIT, result)))

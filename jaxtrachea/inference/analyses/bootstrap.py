@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.table import Column, Table, ends
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.bootstrap import FEWEST, Bootstrap, bootstrap, check_block
 from jaxtrachea.inference.labels import unknown_rows
 from jaxtrachea.inference.rows import and_more
@@ -28,7 +28,7 @@ def _refuse(request: Request) -> None:
         raise SpecError(f"uncertainty.block: {error}") from None
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Bootstrap:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> Bootstrap:
     asked = request.spec.uncertainty
     return bootstrap(
         findings.result, request.settings, count=asked.bootstrap, kind=asked.kind,

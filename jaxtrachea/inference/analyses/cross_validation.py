@@ -8,7 +8,7 @@ from jaxtrachea.config import SpecError
 from jaxtrachea.files.table import Column, Table
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.cross_validation import LeftOut, curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
@@ -33,7 +33,7 @@ def _refuse(request: Request) -> None:
         raise SpecError(f"--leave-one-out: {error}") from None
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> LeftOut:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> LeftOut:
     return leave_one_out(findings.result, request.settings, progress)
 
 

@@ -11,8 +11,8 @@ from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import (
     Analysis,
+    AnalysisResults,
     Cells,
-    Findings,
     Progress,
     Request,
     Unavailable,
@@ -62,7 +62,7 @@ def _refuse(request: Request) -> None:
     candidates_of(request.spec, request.study)
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Design:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> Design:
     section = request.spec.design
     try:
         known = situation(findings.result, findings.get("bootstrap"))

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.fitting.effective import CORRELATED, Effective
-from jaxtrachea.fitting.result import judgement
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.fitting.result import assess
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import determined_unknowns, lane_label
 from jaxtrachea.inference.residuals import where_missed
 from jaxtrachea.inference.rows import worst_first
@@ -15,12 +15,12 @@ from jaxtrachea.inference.rows import worst_first
 NAMED = 5
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Findings:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> AnalysisResults:
     """The fit with the profiles that its intervals rest on; the numbers are the result's own."""
     return findings
 
 
-def _lane_cells(found: Findings, lane: int) -> Cells:
+def _lane_cells(found: AnalysisResults, lane: int) -> Cells:
     result, wide = found.result, found.result.effective
     misses = bool(wide.misses[lane]) and bool(result.succeeded[lane])
     free = bool(result.study.free)
@@ -33,9 +33,9 @@ def _lane_cells(found: Findings, lane: int) -> Cells:
     }
 
 
-def _cells(found: Findings, lane: int, i: int) -> Cells:
+def _cells(found: AnalysisResults, lane: int, i: int) -> Cells:
     """Error and interval as they would be with independent residuals."""
-    low, high = judgement(found.result, lane, i, found.profiles).independent
+    low, high = assess(found.result, lane, i, found.profiles).independent
     return {
         "se_independent": float(found.result.standard_error[lane, i]),
         "low95_independent": low,
@@ -47,7 +47,7 @@ def _correlated(wide: Effective) -> np.ndarray:
     return np.flatnonzero((wide.correlation > CORRELATED) & ~wide.misses)
 
 
-def _sentences(found: Findings) -> Iterator[str]:
+def _sentences(found: AnalysisResults) -> Iterator[str]:
     """Lanes whose intervals grow, and those of which nothing can be said."""
     result = found.result
     wide, every = result.effective, result.lanes
@@ -80,7 +80,7 @@ def _sentences(found: Findings) -> Iterator[str]:
         )
 
 
-def _section(found: Findings) -> list[str]:
+def _section(found: AnalysisResults) -> list[str]:
     said = [f"{sentence}." for sentence in _sentences(found)]
     if said and found.result.study.free:
         said[-1] += (

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtrachea.files.table import Column, Table, number, words
 from jaxtrachea.fitting.lane import Lane, forces, markers
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.influence import Influence, influence
 from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
@@ -30,7 +30,7 @@ REASONS = (
 )
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Influence:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> Influence:
     return influence(findings.result, request.settings.batch)
 
 

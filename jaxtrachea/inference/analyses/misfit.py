@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> FitResult:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> FitResult:
     return findings.result
 
 

@@ -8,8 +8,8 @@ from scipy.special import stdtrit
 from jaxtrachea.files.table import Column, Row, Table, ends, number
 from jaxtrachea.inference.analysis import (
     Analysis,
+    AnalysisResults,
     Cells,
-    Findings,
     Progress,
     Request,
     Unavailable,
@@ -17,7 +17,7 @@ from jaxtrachea.inference.analysis import (
 from jaxtrachea.inference.population import Population, population, wanted
 
 #: Share of estimates with errors above half their value from which logarithms are no good scale.
-UNSURE = 0.1
+MAX_OPEN_SHARE = 0.1
 
 
 def _spread(row: Row) -> str:
@@ -40,7 +40,7 @@ def _asked(request: Request) -> bool:
     return wanted(request.spec.fit.population, request.study)
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Population:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> Population:
     try:
         return population(findings.result, findings.profiles)
     except ValueError as error:
@@ -101,7 +101,7 @@ def _biased(found: Population) -> list[str]:
     for (p, on_bound, open_), count in zip(each, found.known.sum(axis=0), strict=True):
         if on_bound:
             held.append(f"{p.name} {on_bound} of {on_bound + count}")
-        if p.scale == "log" and open_ > UNSURE * count:
+        if p.scale == "log" and open_ > MAX_OPEN_SHARE * count:
             unsure.append(f"{p.name} {open_} of {count}")
     texts = []
     if held:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.table import Column, Table, ends
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import lane_label, unknown_rows
 from jaxtrachea.inference.posterior import MissingSampler, Posterior, posterior, sampler
 from jaxtrachea.inference.rows import and_more
@@ -30,7 +30,7 @@ def _refuse(request: Request) -> None:
         raise SpecError(f"uncertainty.posterior: {error}") from None
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Posterior:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> Posterior:
     asked = request.spec.uncertainty
     return posterior(
         findings.result, draws=asked.posterior, chains=asked.posterior_chains,

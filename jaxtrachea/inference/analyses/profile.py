@@ -9,7 +9,7 @@ from jaxtrachea.config import SpecError
 from jaxtrachea.files.pictures import grid, of_all
 from jaxtrachea.files.table import Column, Interval, Table
 from jaxtrachea.fitting.result import unknown_label, within_bounds
-from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
+from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.profile import Profiles, profiles
 from jaxtrachea.inference.rows import LINES, and_more, listed
@@ -36,7 +36,7 @@ def names_of(request: Request) -> tuple[str, ...]:
     return tuple(names) if names and "all" not in names else free
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Profiles:
+def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> Profiles:
     points = request.spec.uncertainty.profile_points
     names = names_of(request)
     return profiles(findings.result, request.settings, names, points=points, progress=progress)

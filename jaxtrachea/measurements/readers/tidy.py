@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxtrachea.files.table import unquoted
-from jaxtrachea.measurements.checks import STEADY, bad, position
+from jaxtrachea.measurements.checks import POSITION_TOLERANCE, bad, position
 from jaxtrachea.measurements.columns import curve_of_columns
 from jaxtrachea.measurements.curve import (
     BadCurve,
@@ -358,7 +358,7 @@ def _constant(
     if not np.isfinite(column).all():
         line = rows[int(np.argmin(np.isfinite(column)))]
         raise Fault("position", f"{word} {line}: {role} is infinite", "correct it")
-    if np.ptp(column) > STEADY[role]:
+    if np.ptp(column) > POSITION_TOLERANCE[role]:
         raise Fault(
             "position",
             f"{role} varies from {np.nanmin(column):g} to {np.nanmax(column):g} within the curve",

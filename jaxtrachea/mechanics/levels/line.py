@@ -21,7 +21,7 @@ from jaxtrachea.trachea.material import OF_PRESS, VALUES, Material, material_of
 #: Depth to which a skeleton was compared with finite elements, in radii of the tube
 #: (docs/evidence/virtual_trachea.md). At a tenth that specimen yields 13 % more than a linear
 #: skeleton; the others were pressed to half.
-TESTED = {"linear": 0.1, "softening": 0.5}
+VALIDATED_DEPTH = {"linear": 0.1, "softening": 0.5}
 #: Parameters of the beam; all others of a line act at the contact.
 OF_BEAM = tuple(
     name for name, p in VALUES.items()
@@ -49,8 +49,8 @@ class Line(Level):
 
     @property
     def tested(self) -> float:
-        """See `TESTED`; without limit where the force knows no skeleton."""
-        return np.inf if self.options.coupling == "total" else TESTED[self.name]
+        """See `VALIDATED_DEPTH`; without limit where the force knows no skeleton."""
+        return np.inf if self.options.coupling == "total" else VALIDATED_DEPTH[self.name]
 
     @property
     def closed(self) -> "Line":

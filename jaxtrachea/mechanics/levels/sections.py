@@ -19,7 +19,7 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS
 
 #: Depth to which it was compared with finite elements, in radii (docs/evidence/off_midline.md).
-TESTED = 0.5
+VALIDATED_DEPTH = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Sections(Level):
 
     @property
     def tested(self) -> float:
-        """See `TESTED`."""
-        return TESTED
+        """See `VALIDATED_DEPTH`."""
+        return VALIDATED_DEPTH
 
     def tested_angle(self, half_angle: float) -> float:
         """See `press.tested_angle`, with what rounding takes."""

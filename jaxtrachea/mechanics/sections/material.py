@@ -319,7 +319,7 @@ def from_wall(
     slides = (2 - wall.nu) * (1 + wall.nu) / (4 * wall.E_L * tool_radius)
     values["c_t"] = values["c_t_ring"] = factors.slide * slides
     apart = _apart(geometry, wall, tool_radius)
-    unlike = jnp.any(apart > float(np.log(ALIKE))) | (half_width > 0)
+    unlike = jnp.any(apart > float(np.log(PROPORTION_TOLERANCE))) | (half_width > 0)
     values["extrapolated"] = unlike.astype(R.dtype)
     return SectionMaterial(**values)
 
@@ -339,7 +339,7 @@ def furthest_proportion(geometry: Geometry, wall: Wall, tool_radius: float) -> s
         tool_radius: of the tool's flat end, mm.
     """
     apart = np.asarray(_apart(geometry, wall, tool_radius))
-    if not apart.max() > np.log(ALIKE):
+    if not apart.max() > np.log(PROPORTION_TOLERANCE):
         return ""
     i = int(np.argmax(apart))
     given = float(proportions(geometry, wall, tool_radius)[i])
@@ -348,7 +348,7 @@ def furthest_proportion(geometry: Geometry, wall: Wall, tool_radius: float) -> s
 
 #: Largest ratio of a proportion to the specimen's with which `Factors` hold
 #: (docs/evidence/off_midline.md).
-ALIKE = 1.02
+PROPORTION_TOLERANCE = 1.02
 
 
 def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Array, "12"]:

@@ -11,15 +11,15 @@ from scipy.special import stdtrit
 from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
 from jaxtrachea.files.table import Table
-from jaxtrachea.fitting import scrutiny
 from jaxtrachea.fitting import structure as structures
+from jaxtrachea.fitting import verify
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.predictions import Prediction
-from jaxtrachea.fitting.result import judgement, verdict_of
+from jaxtrachea.fitting.result import assess, verdict_of
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
@@ -69,9 +69,9 @@ def verdicts(result, truth):
 
     The latter is the former drawn out by 3 / 1.96 on the logarithm, from the estimate.
     """
-    judged = [[judgement(result, k, i) for i in range(4)] for k in range(result.lanes)]
-    word = np.array([[j.verdict for j in row] for row in judged])
-    low, high = (np.array([[getattr(j, name) for j in row] for row in judged])
+    assessed = [[assess(result, k, i) for i in range(4)] for k in range(result.lanes)]
+    word = np.array([[j.verdict for j in row] for row in assessed])
+    low, high = (np.array([[getattr(j, name) for j in row] for row in assessed])
                  for name in ("low", "high"))  # fmt: skip
     assert [p.name for p in result.study.free] == list(NAMES)
     value = np.maximum(result.value, 1e-300)
@@ -143,17 +143,17 @@ def test_a_twin_skeleton_belongs_to_the_interval(result, pressed):
 def test_all_that_is_written_agrees(result, tmp_path):
     lanes = range(result.lanes)
     table = [row[-1] for row in estimate_table(result, lanes).cells]
-    rows = list(parameter_rows(Findings(result)))
+    rows = list(parameter_rows(AnalysisResults(result)))
     assert [row["verdict"] for row in rows] == table
     summary = [row[f"{n} verdict"] for row in lane_rows(result) for n in NAMES]
     assert summary == table
-    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
     with h5py.File(tmp_path / "r.h5") as file:
         assert [v.decode() for v in file["unknowns/verdict"][()].ravel()] == table
     Table(rows).write_csv(tmp_path / "p.csv")
     with (tmp_path / "p.csv").open(newline="") as stream:
         low = [float(row["low95"]) for row in csv.DictReader(stream)]
-    assert low == [judgement(result, k, i).low for k in lanes for i in range(4)]
+    assert low == [assess(result, k, i).low for k in lanes for i in range(4)]
 
 
 @pytest.mark.slow
@@ -178,24 +178,24 @@ def test_widened_intervals_hold_the_plain_ones(result):
     bounds = [(p.lower, p.upper) for p in given.study.free]
     for k in range(given.lanes):
         for i, (least, most) in enumerate(bounds):
-            judged = judgement(given, k, i)
-            low, high = judged.independent
-            assert least <= judged.low <= low <= given.value[k, i] * (1 + 1e-12)
-            assert given.value[k, i] * (1 - 1e-12) <= high <= judged.high <= most
-            if judged.ends is not None and judged.ends[1] == ProfileEnd.OPEN:
-                assert judged.high == high == most
+            assessed = assess(given, k, i)
+            low, high = assessed.independent
+            assert least <= assessed.low <= low <= given.value[k, i] * (1 + 1e-12)
+            assert given.value[k, i] * (1 - 1e-12) <= high <= assessed.high <= most
+            if assessed.ends is not None and assessed.ends[1] == ProfileEnd.OPEN:
+                assert assessed.high == high == most
     left = wide.samples[5] - 4
     ratio = stdtrit(left, 0.975) * wide.factor[5] / given.uncertainty.half_width[5]
     assert ratio > 1.5
-    judged = judgement(given, 5, 2)
-    found = np.log([judged.low / value, judged.high / value])
+    assessed = assess(given, 5, 2)
+    found = np.log([assessed.low / value, assessed.high / value])
     np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)
-    assert judged.verdict == "weak"  # plain it would be identifiable or weak by 0.4 / 1.96
+    assert assessed.verdict == "weak"  # plain it would be identifiable or weak by 0.4 / 1.96
     # Where an end was not found, the local error is left.
     assert result.study.free[3].scale == "linear"
     local = np.array([result.lower[5, 3], result.upper[5, 3]]) - result.value[5, 3]
-    judged = judgement(given, 5, 3)
-    found = np.array([judged.low, judged.high]) - result.value[5, 3]
+    assessed = assess(given, 5, 3)
+    found = np.array([assessed.low, assessed.high]) - result.value[5, 3]
     np.testing.assert_allclose(found, ratio * local, rtol=1e-9)
 
 
@@ -205,10 +205,8 @@ def test_local_intervals_end_at_the_bounds(result):
     """k_3 of [0, 1e6] had a low95 of -40."""
     lower, upper = result.lower.copy(), result.upper.copy()
     lower[5, 2:], upper[5, 2:] = (0.5, -40.0), (np.inf, 3.0)
-    judged = [
-        judgement(dataclasses.replace(result, lower=lower, upper=upper), 5, i) for i in (2, 3)
-    ]
-    assert [(j.low, j.high) for j in judged] == [(0.5, result.study.free[2].upper), (0, 3)]
+    assessed = [assess(dataclasses.replace(result, lower=lower, upper=upper), 5, i) for i in (2, 3)]
+    assert [(j.low, j.high) for j in assessed] == [(0.5, result.study.free[2].upper), (0, 3)]
 
 
 @pytest.mark.slow
@@ -237,9 +235,9 @@ def test_an_end_that_was_not_found_is_no_proof(result):
         high[4, 2] = result.value[4, 2]
     assert words == ["identifiable", "inconclusive"]
     # Where nothing is known of a side, the local error: no interval of no width.
-    judged = judgement(changed, 4, 2)
-    assert judged.low == low[4, 2]
-    assert judged.high == result.upper[4, 2] > 1.001 * result.value[4, 2]
+    assessed = assess(changed, 4, 2)
+    assert assessed.low == low[4, 2]
+    assert assessed.high == result.upper[4, 2] > 1.001 * result.value[4, 2]
 
 
 @pytest.mark.slow
@@ -247,8 +245,8 @@ def test_an_end_that_was_not_found_is_no_proof(result):
 def test_no_doubt_costs_nothing(study, monkeypatch):
     """Nothing is looked for where nothing gives cause: the estimate is that of the plain fit."""
     clear = study.take(np.full(6, 5))
-    plain = fit(clear, Settings(scrutiny=False))
-    for module, name in ((scrutiny, "scrutinise"), (structures, "structure")):
+    plain = fit(clear, Settings(verify=False))
+    for module, name in ((verify, "verify_minimum"), (structures, "structure")):
         monkeypatch.setattr(module, name, None)
     usual = fit(clear)
     np.testing.assert_array_equal(usual.theta, plain.theta)

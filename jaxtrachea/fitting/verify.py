@@ -84,7 +84,7 @@ class _Region:
         return within.any(axis=1)
 
 
-def scrutinise(
+def verify_minimum(
     result: FitResult,
     minima: Minima,
     doubts: Bool[np.ndarray, "lanes P"],

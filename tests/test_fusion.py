@@ -22,15 +22,15 @@ from jaxtrachea import (
     Material,
     Options,
     Poses,
-    _in_order,
+    fusion,
     press,
     press_oblique,
     press_path,
     table_1,
 )
-from jaxtrachea._in_order import in_order, lanes_in_one_kernel, one_kernel
 from jaxtrachea._numerics import epsilon, largest
 from jaxtrachea.contact.shapes import capsule
+from jaxtrachea.fusion import fuse, fuse_batch, in_order
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.scene.deform import _sag
@@ -39,8 +39,8 @@ DTYPES = [*late("float32"), "float64"]
 NOT_INLINED = 'inlineable="false"'
 #: With the first word: XLA makes calls of its own small loops.
 ONE = f'{NOT_INLINED},xla_cpu_small_call="true"'
-BOTH = pytest.mark.parametrize("mark", [in_order, one_kernel])
-ALL = pytest.mark.parametrize("mark", [in_order, one_kernel, lanes_in_one_kernel])
+BOTH = pytest.mark.parametrize("mark", [in_order, fuse])
+ALL = pytest.mark.parametrize("mark", [in_order, fuse, fuse_batch])
 pytestmark = [pytest.mark.usefixtures("on_the_cpu"), pytest.mark.compiling]
 
 
@@ -326,9 +326,9 @@ def test_an_older_jax_has_the_part_itself(missing, monkeypatch):
         monkeypatch.setattr("jax.experimental.xla_metadata.set_xla_metadata", without_value)
     else:
         monkeypatch.setitem(sys.modules, "jax.experimental.xla_metadata", None)
-    mark = _in_order._mark("without", _in_order._told(inlineable="false"))
+    mark = fusion._mark("without", fusion._told(inlineable="false"))
     assert mark is None
-    monkeypatch.setattr(_in_order, "_not_inlined_p", mark)
+    monkeypatch.setattr(fusion, "_not_inlined_p", mark)
     x, y = numbers("float64")
     marked = in_order(part)
     close(jax.jit(marked)(x, y), part(x, y))
@@ -351,9 +351,9 @@ def test_one_kernel_is_one(dtype):
         return jax.lax.fori_loop(0, 60, step, x + a)
 
     a = jnp.linspace(1, 27, 300, dtype=dtype)
-    marked, one = one_kernel(root), jnp.ones_like(a)
+    marked, one = fuse(root), jnp.ones_like(a)
     np.testing.assert_allclose(jax.jit(marked)(one, a), np.cbrt(a), rtol=8 * epsilon(a.dtype))
-    if _in_order._one_kernel_p is not None:
+    if fusion._one_kernel_p is not None:
         assert count_kernels(compiled(root, one, a))[0] > 60
         assert count_kernels(compiled(marked, one, a), inside=False) == (1, 0)
     many = compiled(jax.vmap(marked), jnp.stack([one] * 4), jnp.stack([a] * 4))
@@ -375,7 +375,7 @@ def test_many_lanes_in_one_kernel_are_one(dtype):
         return jax.jvp(root, (a,), (jnp.ones_like(a),))
 
     a = jnp.linspace(1, 27, 30, dtype=dtype)
-    marked = lanes_in_one_kernel(part)
+    marked = fuse_batch(part)
     lanes = {1: a, 2: jnp.stack([a, 2 * a, 3 * a]), 3: jnp.stack([a, 2 * a])[None]}
     for axes, at in lanes.items():
         f, plain = marked, part
@@ -385,12 +385,12 @@ def test_many_lanes_in_one_kernel_are_one(dtype):
         np.testing.assert_allclose(got, np.cbrt(at), rtol=8 * epsilon(a.dtype))
         np.testing.assert_allclose(slope, np.cbrt(at) ** -2 / 3, rtol=32 * epsilon(a.dtype))
         text = compiled(f, at)
-        assert (ONE in text) == (axes > 1 and _in_order._one_kernel_p is not None)
+        assert (ONE in text) == (axes > 1 and fusion._one_kernel_p is not None)
         if ONE in text:
             assert count_kernels(compiled(plain, at))[0] > 40
             assert count_kernels(text, inside=False) == (1, 0)
     # Of arrays that are not small it is not one.
-    many = jnp.broadcast_to(a, (_in_order.SMALL // 30 + 1, 30))
+    many = jnp.broadcast_to(a, (fusion.SMALL // 30 + 1, 30))
     assert ONE not in compiled(jax.vmap(marked), many)
 
 
@@ -398,7 +398,7 @@ def test_many_lanes_in_one_kernel_are_one(dtype):
 def test_derivatives_of_one_kernel_are_one_each(dtype):
     """Sum of y exp(-x^2): there, back, and back of what goes there, against calculus."""
     x, y = numbers(dtype, (100,))
-    each = one_kernel(lambda x, y: (y * jnp.exp(-(x**2)), jnp.argmax(x)))
+    each = fuse(lambda x, y: (y * jnp.exp(-(x**2)), jnp.argmax(x)))
 
     def of(x, y):
         return jnp.sum(each(x, y)[0])
@@ -412,7 +412,7 @@ def test_derivatives_of_one_kernel_are_one_each(dtype):
     close(curved(x), (4 * x**2 - 2) * y**2 * bell)
     lanes = jax.jit(jax.vmap(back))(x[:, None], y[:, None])
     close(jax.tree.map(lambda v: v[:, 0], lanes), (-2 * x * y * bell, bell))
-    if _in_order._one_kernel_p is not None:
+    if fusion._one_kernel_p is not None:
         for f in (lambda x: jax.grad(of)(x, y), lambda x: there(x, y)):
             calls = [v for v in compiled(f, x).split("\n") if " call(" in v]
             assert [ONE in v for v in calls] == [True]
@@ -463,8 +463,8 @@ def test_what_one_kernel_cannot_hold_is_compiled_as_before(what):
     """Sorting, libraries, large arrays and those without entries."""
     x, y = numbers("float64")
     part = UNFIT[what]
-    close(jax.jit(one_kernel(part))(x, y), jax.jit(part)(x, y))
-    assert ONE not in compiled(one_kernel(part), x, y)
+    close(jax.jit(fuse(part))(x, y), jax.jit(part)(x, y))
+    assert ONE not in compiled(fuse(part), x, y)
 
 
 def test_inputs_that_one_kernel_does_not_read():
@@ -480,7 +480,7 @@ def test_inputs_that_one_kernel_does_not_read():
         return jnp.where(on, jnp.sin(x), 0), jnp.zeros_like(y), n, again, x + turn[0]
 
     def run(x, y):
-        return one_kernel(part)(x, y, turn, jnp.asarray(7), x[0] > -9, x)
+        return fuse(part)(x, y, turn, jnp.asarray(7), x[0] > -9, x)
 
     for f in (run, jax.vmap(run)):
         at = (x, y) if f is run else (x[None], y[None])
@@ -495,14 +495,14 @@ def test_inputs_that_one_kernel_does_not_read():
 @pytest.mark.slow
 def test_another_compiler_runs_it_in_order(monkeypatch):
     """With a jaxlib that nobody has tried."""
-    monkeypatch.setattr(_in_order, "_one_kernel_p", None)
+    monkeypatch.setattr(fusion, "_one_kernel_p", None)
     x, y = numbers("float64")
-    marked = one_kernel(part)
+    marked = fuse(part)
     close(jax.jit(marked)(x, y), part(x, y))
     text = compiled(marked, x, y)
     assert NOT_INLINED in text
     assert ONE not in text
-    lanes, plain = (jax.vmap(f) for f in (lanes_in_one_kernel(part), part))
+    lanes, plain = (jax.vmap(f) for f in (fuse_batch(part), part))
     at = numbers("float64", (4,))
     for way in (lambda f: f, lambda f: lambda *v: jax.jvp(f, v, v)):
         close(jax.jit(way(lanes))(*at), way(plain)(*at))
@@ -512,7 +512,7 @@ def test_another_compiler_runs_it_in_order(monkeypatch):
 @pytest.mark.slow
 def test_without_single_kernels():
     """The switch in the environment, read when the package is imported."""
-    program = "from jaxtrachea import _in_order as m; assert m._one_kernel_p is None"
+    program = "from jaxtrachea import fusion as m; assert m._one_kernel_p is None"
     environment = os.environ | {"JAXTRACHEA_ONE_KERNEL": "0"}
     subprocess.run([sys.executable, "-c", program], env=environment, check=True)
 
@@ -535,9 +535,9 @@ def test_reductions_of_many_entries(what, entries, dtype):
     """The compiler refuses those of 4,096 entries and more in a kernel."""
     part = REDUCTIONS[what]
     x = jnp.asarray(np.random.default_rng(3).uniform(0, 1, entries), dtype)
-    marked = one_kernel(part)
+    marked = fuse(part)
     np.testing.assert_allclose(jax.jit(marked)(x), part(x), rtol=1e2 * epsilon(x.dtype))
-    if _in_order._one_kernel_p is not None:
+    if fusion._one_kernel_p is not None:
         assert (ONE in compiled(marked, x)) == (entries == 4000)
 
 
@@ -546,13 +546,13 @@ def test_what_is_not_numbers_is_not_in_one_kernel():
     """Keys of random numbers, and complex ones."""
     x, key = numbers("float64")[0], jax.random.key(3)
     for extra in (key, jnp.asarray(1 + 2j)):
-        marked = one_kernel(lambda x, extra: (jnp.sin(x), extra))
+        marked = fuse(lambda x, extra: (jnp.sin(x), extra))
         np.testing.assert_allclose(jax.jit(marked)(x, extra)[0], np.sin(x), rtol=1e-14)
         assert ONE not in compiled(marked, x, extra)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mark", [in_order, one_kernel])
+@pytest.mark.parametrize("mark", [in_order, fuse])
 def test_programs_for_several_devices_have_no_marks(mark):
     """One text for all of them; for another device alone too."""
     x, y = numbers("float64")
@@ -612,7 +612,7 @@ def test_presses_and_their_derivatives_fit_one_kernel(name):
 
     ways = (numbers, *given), (push, given, given), (pull, given, jax.eval_shape(numbers, *given))
     for f, *arguments in ways:
-        assert _in_order.fits_one_kernel(jax.make_jaxpr(f)(*arguments).jaxpr), f.__name__
+        assert fusion.fits_one_kernel(jax.make_jaxpr(f)(*arguments).jaxpr), f.__name__
 
 
 @pytest.mark.slow
@@ -621,9 +621,9 @@ def test_presses_and_their_derivatives_fit_one_kernel(name):
 def test_running_sums_are_in_one_kernel(n, dtype):
     """Stretches of the ligament add up from either end: of any number of rings, there and back."""
     x = jnp.asarray(np.random.default_rng(8).normal(size=n), dtype)
-    f = one_kernel(lambda x: jnp.cumsum(x) + 2 * jnp.cumsum(x[::-1])[::-1])
+    f = fuse(lambda x: jnp.cumsum(x) + 2 * jnp.cumsum(x[::-1])[::-1])
     run = jax.jit(f).lower(x).compile()
-    assert (ONE in run.as_text()) == (_in_order._one_kernel_p is not None)
+    assert (ONE in run.as_text()) == (fusion._one_kernel_p is not None)
     v = np.asarray(x, float)
     atol = 4 * n * epsilon(x.dtype)
     np.testing.assert_allclose(run(x), v.cumsum() + 2 * v[::-1].cumsum()[::-1], rtol=0, atol=atol)
@@ -637,7 +637,7 @@ def test_a_tool_of_few_corners_is_in_the_kernel_that_lays_out_a_dent():
     pose = Poses(jnp.eye(3), jnp.asarray([70.0, 15.0, 0.0]))
     tool = capsule(2.0, 6.0)
     program = jax.make_jaxpr(lambda points: _sag(tool, pose, points))(jnp.ones((16, 3)))
-    assert _in_order.fits_one_kernel(program.jaxpr)
+    assert fusion.fits_one_kernel(program.jaxpr)
 
 
 @pytest.mark.slow
@@ -650,7 +650,7 @@ def test_a_loss_of_a_press_by_its_public_name(dtype):
     tube = jax.tree.map(lambda v: jnp.asarray(v, dtype), table_1())
     stiff = jnp.asarray(1e9, dtype)
 
-    @jaxtrachea.one_kernel
+    @jaxtrachea.fuse
     def loss(k_1, depth):
         return press(tube, Material(stiff, stiff, k_1, 0.0), tube.length / 2, depth).force ** 2
 
@@ -665,6 +665,6 @@ def test_a_loss_of_a_press_by_its_public_name(dtype):
                 way(k_1[i], depth[i]), (expected[i], slope[i]), rtol=tolerance
             )
     np.testing.assert_allclose(many(k_1, depth), (expected, slope), rtol=tolerance)
-    if _in_order._one_kernel_p is not None:
+    if fusion._one_kernel_p is not None:
         assert compiled(one, k_1[0], depth[0]).count(ONE) > 0
     assert ONE not in compiled(many, k_1, depth)

@@ -6,7 +6,7 @@ that takes half as long again as they do. One large array (a surface) is enough 
 small part is a computation of its own: `in_order`.
 
 Starting a kernel takes as long as some hundred operations. What XLA makes of its own small loops
-can be asked for: the whole part in one function, with loops and branches, `one_kernel`. That is for
+can be asked for: the whole part in one function, with loops and branches, `fuse`. That is for
 parts whose arrays are small: one thread works through them. A kernel calls no library and holds no
 scatter: a product of matrices is written as a sum (`_numerics.product`, `turned`; of a part that is
 also called in batches by `_written_out`), a choice by place as a sum of choices (`picked`), the
@@ -39,10 +39,10 @@ from jaxtrachea._written_out import written_out
 Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
 MARKS = "not_inlined", "one_kernel", "hidden"
-#: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
+#: Versions of jaxlib whose compiler was seen to do `fuse` right (tests/test_fusion.py). A
 #: compiler that cannot put a part into one kernel refuses the program or ends the process: with
 #: others it is as `in_order`.
-TESTED = ("0.10.2", "0.11.2", "0.12.0.1")
+SUPPORTED_JAXLIB = ("0.10.2", "0.11.2", "0.12.0.1")
 
 
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -62,15 +62,15 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     return _called(part, _in_order)
 
 
-def one_kernel(part: Callable[..., Out], *, products: bool = False) -> Callable[..., Out]:
+def fuse(part: Callable[..., Out], *, products: bool = False) -> Callable[..., Out]:
     """The same function, compiled into a single kernel: one call at a time, on a CPU.
 
     For programs of many small operations, whose time goes into starting kernels. It works where
     the call is traced (under `jit`); a batch (`vmap`), another device or another compiler than
-    those of `TESTED` gets the function as it is. Not where it does what `FITTING` lacks (products
-    of matrices, but see `products`; linear algebra, sorting with `top_k`, `.at[]`), reduces more
-    than `REDUCED` entries, or has arrays that are not `SMALL` or not of numbers: that is compiled
-    as `in_order`.
+    those of `SUPPORTED_JAXLIB` gets the function as it is. Not where it does what `FITTING` lacks
+    (products of matrices, but see `products`; linear algebra, sorting with `top_k`, `.at[]`),
+    reduces more than `REDUCED` entries, or has arrays that are not `SMALL` or not of numbers: that
+    is compiled as `in_order`.
     So it is with its derivatives, each by itself. Values and derivatives are the same but for
     rounding. A derivative begins with the part once more: of a batch it takes somewhat longer than
     that of the function by itself, so mark what is called one at a time.
@@ -85,12 +85,12 @@ def one_kernel(part: Callable[..., Out], *, products: bool = False) -> Callable[
     return _called(part, _kernel_of_products if products else _kernel)
 
 
-def lanes_in_one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
+def fuse_batch(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function; many lanes together (`vmap`) are a single kernel, on a CPU.
 
-    For parts of many small steps, a sweep over the rings say, where `one_kernel` is for one call:
+    For parts of many small steps, a sweep over the rings say, where `fuse` is for one call:
     of some hundred lanes each step is still a small kernel. Arrays of all lanes together are to be
-    `SMALL`, sums of `REDUCED` entries, and nothing else than `one_kernel` can do; otherwise, with
+    `SMALL`, sums of `REDUCED` entries, and nothing else than `fuse` can do; otherwise, with
     another compiler, and for one call, the function is as it is. Take derivatives inside the part,
     one after the other (`jax.jvp`, not under `vmap`, which breaks the lanes into short rows): those
     taken from outside are calls of their own, which begin with the part once more; twice backwards
@@ -102,12 +102,12 @@ def lanes_in_one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
     return _called(part, _kernel_of_lanes)
 
 
-def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
+def map_sequentially(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function; of many lanes (`vmap`), on a CPU, one lane after the other.
 
     For parts that are a large array and go through it several times: those of many lanes are out of
     the cache before they are read again. A lane, on a CPU, is then as if there were no other:
-    `in_order` and `one_kernel` inside are what they say. Small arrays (`_linear.LARGE`) and other
+    `in_order` and `fuse` inside are what they say. Small arrays (`_linear.LARGE`) and other
     devices take all lanes together. Values and derivatives are the same but for rounding;
     derivatives begin with the part once more, and are taken in turn too; twice backwards through a
     loop only from JAX 0.11 on.
@@ -151,10 +151,10 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
             return _changing(jaxpr, {variables[read[i]] for i in moving})
 
         inputs = [given[i] for i in read]
-        judged = jaxpr
+        assessed = jaxpr
         if how is _kernel_of_products:
-            judged = written_out(jax.make_jaxpr(plain)(*inputs)).jaxpr
-        fits = _one_kernel_p is not None and fits_one_kernel(judged)
+            assessed = written_out(jax.make_jaxpr(plain)(*inputs)).jaxpr
+        fits = _one_kernel_p is not None and fits_one_kernel(assessed)
         refused = how in (_kernel, _kernel_of_products) and not fits
         found = _differentiable(plain, changing, _in_order if refused else how)(*inputs)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
@@ -500,7 +500,10 @@ def _all_read(x, *rest):
 
 _not_inlined_p = _mark(MARKS[0], _told(inlineable="false"))
 _one_kernel_p = _hidden_p = None
-if jaxlib.version.__version__ in TESTED and os.environ.get("JAXTRACHEA_ONE_KERNEL") != "0":
+if (
+    jaxlib.version.__version__ in SUPPORTED_JAXLIB
+    and os.environ.get("JAXTRACHEA_ONE_KERNEL") != "0"
+):
     _small_call = _told(inlineable="false", xla_cpu_small_call="true")
     _one_kernel_p = _mark(
         MARKS[1], lambda x, read, *_: _all_read(_small_call(x), _small_call(read))

@@ -2,11 +2,11 @@ r"""The place of the tube that a tool holds from step to step, and how that plac
 
 While the gap of the undeformed tube is negative the tool is on the tube, pressed in by
 delta = -gap. It holds the place that it touched first: the way that its body point there has gone
-since is the press e of that place, as in `simulate`. The seat gives way where
+since is the press e of that place, as in `simulate`. The anchor gives way where
 
-    |e_t| > delta               it went further along the surface than in (`HOLD`),
-    |e_n - delta| > delta / 2   turned or led off, it presses elsewhere (`APART`), or
-    F_n < 0.1 F_n0              the place would have to be pulled (`LEAST`),
+    |e_t| > delta               it went further along the surface than in (`MAX_SLIDE`),
+    |e_n - delta| > delta / 2   turned or led off, it presses elsewhere (`MAX_MISMATCH`), or
+    F_n < 0.1 F_n0              the place would have to be pulled (`LEAST_FORCE_SHARE`),
 
 by sliding: e moves straight towards the press delta n that goes straight in (of force F_0), as far
 as to the border of these. The place follows the tool's contact at a distance of at most delta. Both
@@ -15,12 +15,12 @@ same pose again changes nothing. Sliding takes energy out as long as the deforme
 by less than 45 degrees at the contact, and a place pushed inwards would go less far aside than in:
 then the work over closed loops of the tool is not negative.
 
-`HOLD` limits the way along the surface, not the force. It is no law of friction: the tangential
-force is what the skeleton answers to that way, in 5,000 poses 0.69 of the normal force in the
-median, 2.4 at most (`tests/bench/jumps.py`). With contact point
-`per_step` there is no way along the surface; `scene.configurational` has its force.
+`MAX_SLIDE` limits the way along the surface, not the force. It is no law of friction: the
+tangential force is what the skeleton answers to that way, in 5,000 poses 0.69 of the normal force
+in the median, 2.4 at most (`tests/bench/jumps.py`). With contact point `per_step` there is no way
+along the surface; `scene.configurational` has its force.
 
-A tool that goes further along the tube in one step than its dent is wide has left its seat: it
+A tool that goes further along the tube in one step than its dent is wide has left its anchor: it
 grasps anew where it is. A glued tool (`bonded`) holds its first place whatever it does.
 """
 
@@ -43,14 +43,14 @@ from jaxtrachea.scene.refusals import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 
-#: Way along the surface that a seat holds, over the depth.
-HOLD = 1.0
-#: Largest difference of the seat's press and the tool's depth, over the depth.
-APART = 0.5
+#: Way along the surface that a anchor holds, over the depth.
+MAX_SLIDE = 1.0
+#: Largest difference of the anchor's press and the tool's depth, over the depth.
+MAX_MISMATCH = 0.5
 #: Least normal force, over that of a press straight in.
-LEAST = 0.1
-#: Share of half a ring spacing that a seat holds at most: beyond it one place does not serve.
-NEAR = 0.99
+LEAST_FORCE_SHARE = 0.1
+#: Share of half a ring spacing that a anchor holds at most: beyond it one place does not serve.
+SPACING_SHARE = 0.99
 #: Length of the press over the depth, at most: with it the local law is at its stiffest.
 STRETCHED = 3.0
 
@@ -62,7 +62,7 @@ class Instant(NamedTuple):
     seen: Touch
 
 
-class Seat(NamedTuple):
+class Anchor(NamedTuple):
     """The place that the tool holds, in the frame of the mesh.
 
     Attributes:
@@ -70,7 +70,7 @@ class Seat(NamedTuple):
         phi: its angle, rad.
         point: of the tube at rest, mm; shape (3,).
         body: point of the tool that holds it, in the tool's frame, mm; shape (3,).
-        anchor: where that point would be without a press, mm; shape (3,).
+        unpressed: where that point would be without a press, mm; shape (3,).
         rotation: of the tool as it would stand there; shape (3, 3).
         translation: likewise, mm; shape (3,).
         status: `ContactStatus` of the contact it comes from.
@@ -80,32 +80,32 @@ class Seat(NamedTuple):
     phi: Float[Array, ""]
     point: Float[Array, "3"]
     body: Float[Array, "3"]
-    anchor: Float[Array, "3"]
+    unpressed: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
     translation: Float[Array, "3"]
     status: Int[Array, ""]
 
 
-def grasp(scene: Scene, here: Instant) -> Seat:
-    """The seat of a tool that stands on its contact, pressed straight in."""
+def anchor_at(scene: Scene, here: Instant) -> Anchor:
+    """The anchor of a tool that stands on its contact, pressed straight in."""
     path, seen = jax.tree.map(lambda v: v[0], tuple(here))
     pose = Pose(path.rotation, path.translation)
     body = transform(inverse(pose), seen.tool_point[:, None])[:, 0]
     lift = seen.gap * _to_mesh(scene, seen.s, local_frame(seen.phi)[0])
-    return Seat(
+    return Anchor(
         s=seen.s,
         phi=seen.phi,
         point=seen.point,
         body=body,
-        anchor=_at(path, body) + lift,
+        unpressed=_at(path, body) + lift,
         rotation=path.rotation,
         translation=path.translation + lift,
         status=seen.status,
     )
 
 
-def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
-    """The seat of a first touch: the way along the surface since then counts."""
+def first_contact(scene: Scene, before: Instant, here: Instant) -> Anchor:
+    """The anchor of a first touch: the way along the surface since then counts."""
 
     def join(v, w):
         return jnp.concatenate([v, w])
@@ -113,78 +113,80 @@ def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
     path = jax.tree.map(join, before.path, here.path)
     seen = jax.tree.map(join, before.seen, here.seen)
     place = landing(scene, path, seen, jnp.asarray(1))
-    seat = Seat(
-        s=place.s, phi=place.phi, point=place.point, body=place.body, anchor=place.point,
+    anchor = Anchor(
+        s=place.s, phi=place.phi, point=place.point, body=place.body, unpressed=place.point,
         rotation=place.rotation, translation=place.translation, status=here.seen.status[0],
     )  # fmt: skip
-    return anchored(scene, seat, _times(local_frame(seat.phi), place.way[1]), here.path)
+    return re_anchor(scene, anchor, _times(local_frame(anchor.phi), place.way[1]), here.path)
 
 
-def left(scene: Scene, seat: Seat, before: Instant, here: Instant) -> Bool[Array, ""]:
+def has_left(scene: Scene, anchor: Anchor, before: Instant, here: Instant) -> Bool[Array, ""]:
     """Whether the tool went further along the tube in this step than its dent is wide."""
-    way = way_of(scene, seat, here.path) - way_of(scene, seat, before.path)
+    way = press_vector(scene, anchor, here.path) - press_vector(scene, anchor, before.path)
     return _length(way[1:]) > scene.footprint + jnp.maximum(-here.seen.gap[0], 0)
 
 
-def drawn(scene: Scene, seat: Seat, here: Instant) -> Seat:
-    """The seat after its place has followed the tool's contact; its press is the same vector."""
-    now = grasp(scene, here)
-    turn = now.phi - seat.phi
+def follow(scene: Scene, anchor: Anchor, here: Instant) -> Anchor:
+    """The anchor after its place has followed the tool's contact; its press is the same vector."""
+    now = anchor_at(scene, here)
+    turn = now.phi - anchor.phi
     turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
-    lag = jnp.stack([now.s - seat.s, scene.radius * turn])
-    share = 1 - _limit(_hold(scene, -here.seen.gap[0]), _length(lag))
+    lag = jnp.stack([now.s - anchor.s, scene.radius * turn])
+    share = 1 - _limit(_largest_slide(scene, -here.seen.gap[0]), _length(lag))
 
     def mix(old, new):
         return old + share * (new - old)
 
-    body = mix(seat.body, now.body)
+    body = mix(anchor.body, now.body)
     path = _one(here.path)
-    phi = seat.phi + share * turn
-    return Seat(
-        s=mix(seat.s, now.s),
+    phi = anchor.phi + share * turn
+    return Anchor(
+        s=mix(anchor.s, now.s),
         phi=jnp.arctan2(jnp.sin(phi), jnp.cos(phi)),
-        point=mix(seat.point, now.point),
+        point=mix(anchor.point, now.point),
         body=body,
-        anchor=seat.anchor + _at(path, body) - _at(path, seat.body),
-        rotation=nearest_rotation(mix(seat.rotation, now.rotation), now.rotation),
-        translation=mix(seat.translation, now.translation),
-        status=jnp.where(share > 0, now.status, seat.status),
+        unpressed=anchor.unpressed + _at(path, body) - _at(path, anchor.body),
+        rotation=nearest_rotation(mix(anchor.rotation, now.rotation), now.rotation),
+        translation=mix(anchor.translation, now.translation),
+        status=jnp.where(share > 0, now.status, anchor.status),
     )
 
 
-def place_of(scene: Scene, material: Material, seat: Seat) -> Place | None:
-    """What the skeleton does at the seat; None if the plan has a single plane."""
+def place_of(scene: Scene, material: Material, anchor: Anchor) -> Place | None:
+    """What the skeleton does at the anchor; None if the plan has a single plane."""
     plan = scene.plan
     if not plan.second_plane:
         return None
-    s, phi, _ = on_the_tube(scene, seat.s, seat.phi)
+    s, phi, _ = on_the_tube(scene, anchor.s, anchor.phi)
     return place_at(scene.geometry, material, s, phi, plan.oblique)
 
 
-def way_of(scene: Scene, seat: Seat, path: Poses) -> Float[Array, "3"]:
-    """How far the tool has pressed its seat, mm: along (inward, tangent, round the tube)."""
-    way = _at(_one(path), seat.body) - seat.anchor
-    axes = axes_at(scene, seat.s)
-    return _times(local_frame(seat.phi), way if axes is None else _times(axes.T, way))
+def press_vector(scene: Scene, anchor: Anchor, path: Poses) -> Float[Array, "3"]:
+    """How far the tool has pressed its anchor, mm: along (inward, tangent, round the tube)."""
+    way = _at(_one(path), anchor.body) - anchor.unpressed
+    axes = axes_at(scene, anchor.s)
+    return _times(local_frame(anchor.phi), way if axes is None else _times(axes.T, way))
 
 
-def given_way(
+def yielded(
     scene: Scene, way: Float[Array, "3"], depth: Float[Array, ""], place: Place | None
 ) -> Float[Array, "3"]:
-    """What is left of a press after the seat has given way: no more than the borders allow.
+    """What is left of a press after the anchor has given way: no more than the borders allow.
 
     Args:
         scene: -
-        way: of the press, see `way_of`.
+        way: of the press, see `press_vector`.
         depth: -gap of the tool, mm; positive.
-        place: the skeleton at the seat.
+        place: the skeleton at the anchor.
     """
     off = way - depth * jnp.eye(3, dtype=way.dtype)[0]
-    share = _limit(_hold(scene, depth), _length(off[1:]))
-    share = jnp.minimum(share, _limit(APART * depth, jnp.abs(off[0])))
+    share = _limit(_largest_slide(scene, depth), _length(off[1:]))
+    share = jnp.minimum(share, _limit(MAX_MISMATCH * depth, jnp.abs(off[0])))
     row = _stiffness(scene, depth, place)
     if row is not None:
-        share = jnp.minimum(share, _limit((1 - LEAST) * depth * row[0], -jnp.sum(row * off)))
+        share = jnp.minimum(
+            share, _limit((1 - LEAST_FORCE_SHARE) * depth * row[0], -jnp.sum(row * off))
+        )
     return way - (1 - share) * off
 
 
@@ -207,28 +209,28 @@ def _stiffness(scene: Scene, depth, place: Place | None) -> Float[Array, "3"] | 
 
 
 def as_approach(
-    scene: Scene, seat: Seat, way: Float[Array, "3"], here: Instant, inside: Bool[Array, "1"]
+    scene: Scene, anchor: Anchor, way: Float[Array, "3"], here: Instant, inside: Bool[Array, "1"]
 ) -> tuple[Poses, Approach]:
-    """One row for `simulation.pressed`: the tool as it stands on its seat, and what it does."""
-    frame, axes = local_frame(seat.phi), axes_at(scene, seat.s)
+    """One row for `simulation.pressed`: the tool as it stands on its anchor, and what it does."""
+    frame, axes = local_frame(anchor.phi), axes_at(scene, anchor.s)
     now = jax.tree.map(lambda v: v[0], here.seen)
     seen = dataclasses.replace(
-        now, gap=jnp.zeros_like(now.gap), point=seat.point, s=seat.s, phi=seat.phi,
-        status=seat.status,
+        now, gap=jnp.zeros_like(now.gap), point=anchor.point, s=anchor.s, phi=anchor.phi,
+        status=anchor.status,
     )  # fmt: skip
-    presses = Presses(seat.s[None], seat.phi[None], _times(frame.T, way)[None])
+    presses = Presses(anchor.s[None], anchor.phi[None], _times(frame.T, way)[None])
     made = Approach(
         seen=jax.tree.map(lambda v: v[None], seen),
         presses=presses,
         inward=frame[:1],
         first=jnp.asarray(0),
         landing=Landing(
-            s=seat.s,
-            phi=seat.phi,
-            point=seat.point,
-            body=seat.body,
-            rotation=seat.rotation,
-            translation=seat.translation,
+            s=anchor.s,
+            phi=anchor.phi,
+            point=anchor.point,
+            body=anchor.body,
+            rotation=anchor.rotation,
+            translation=anchor.translation,
             frame=axes,
             way=presses.displacement,
         ),
@@ -236,18 +238,18 @@ def as_approach(
         own=here.seen,
         inside=inside,
     )
-    return Poses(seat.rotation[None], seat.translation[None]), made
+    return Poses(anchor.rotation[None], anchor.translation[None]), made
 
 
-def anchored(scene: Scene, seat: Seat, way: Float[Array, "3"], path: Poses) -> Seat:
-    """The seat that this way presses, with the tool where it is."""
-    press = _to_mesh(scene, seat.s, _times(local_frame(seat.phi).T, way))
-    return seat._replace(anchor=_at(_one(path), seat.body) - press)
+def re_anchor(scene: Scene, anchor: Anchor, way: Float[Array, "3"], path: Poses) -> Anchor:
+    """The anchor that this way presses, with the tool where it is."""
+    press = _to_mesh(scene, anchor.s, _times(local_frame(anchor.phi).T, way))
+    return anchor._replace(unpressed=_at(_one(path), anchor.body) - press)
 
 
-def _hold(scene: Scene, depth):
-    """Way along the surface that a seat holds at this depth, mm."""
-    return jnp.minimum(HOLD * depth, NEAR * half_spacing(scene))
+def _largest_slide(scene: Scene, depth):
+    """Way along the surface that a anchor holds at this depth, mm."""
+    return jnp.minimum(MAX_SLIDE * depth, SPACING_SHARE * half_spacing(scene))
 
 
 def _to_mesh(scene: Scene, s, vector):

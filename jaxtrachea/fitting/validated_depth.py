@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.levels.choose import level_of
-from jaxtrachea.mechanics.levels.line import TESTED
+from jaxtrachea.mechanics.levels.line import VALIDATED_DEPTH
 from jaxtrachea.mechanics.levels.options import Options
 
 
@@ -39,7 +39,7 @@ def untested(options: Options, radius: float, depth: float, counted: str = "") -
     return f"the model was tested to D = {most:.3g} mm{counted}" if depth > most else ""
 
 
-def deeper_than_tested(
+def deeper_than_validated(
     curves: Sequence[Curve],
     options: Options,
     radius: float,
@@ -65,7 +65,7 @@ def deeper_than_tested(
     if not deep:
         return None
     cure = "cut them off or leave them out where that matters"
-    if level_of(options).tested < TESTED["softening"]:
+    if level_of(options).tested < VALIDATED_DEPTH["softening"]:
         cure = "choose skeleton = 'softening' or 'sections'"
     return (
         f"{len(deep)} of {len(curves)} curves go to {max(deep):.3g} mm{counted}; skeleton = "
