@@ -263,12 +263,14 @@ def test_a_first_result_without_a_derivative(first, dtype):
         close(jax.jit(jax.vmap(f, (None, 0)))(x, jnp.arange(3))[1], x**3)
 
 
+@pytest.mark.slow
 def test_no_results_and_no_arguments():
     assert jax.jit(in_order(lambda x: (None, ())))(jnp.ones(3)) == (None, ())
     assert in_order(lambda: 3)() == 3  # nothing traced: the part itself, not through JAX
     assert jax.jit(lambda x: in_order(lambda: x + 1)())(jnp.ones(())) == 2
 
 
+@pytest.mark.slow
 def test_linear_parts_are_transposed():
     x, y = numbers("float64")
     f = in_order(lambda v: (2 * v, x * v[::-1]))
@@ -394,6 +396,7 @@ def test_many_lanes_in_one_kernel_are_one(dtype):
     assert ONE not in compiled(jax.vmap(marked), many)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_derivatives_of_one_kernel_are_one_each(dtype):
     """Sum of y exp(-x^2): there, back, and back of what goes there, against calculus."""
@@ -419,6 +422,7 @@ def test_derivatives_of_one_kernel_are_one_each(dtype):
             assert ONE not in compiled(jax.vmap(f), x[None].repeat(4, 0))
 
 
+@pytest.mark.slow
 @ALL
 def test_what_is_not_used_has_no_part_in_a_derivative(mark):
     """The root has a slope without bound at 0, of which 0 times is no number."""
@@ -467,6 +471,7 @@ def test_what_one_kernel_cannot_hold_is_compiled_as_before(what):
     assert ONE not in compiled(fuse(part), x, y)
 
 
+@pytest.mark.slow
 def test_inputs_that_one_kernel_does_not_read():
     """The compiler would end the process.
 

@@ -176,6 +176,7 @@ def largest_array(text: str) -> int:
     return max(math.prod(shape) * bits // 8 for bits, shape in shapes)
 
 
+@pytest.mark.slow
 def test_the_count_of_kernels():
     """By hand: 2 + 3 rounds of (1 + 1) + the reduction in a call."""
     text = """
@@ -210,6 +211,7 @@ ENTRY %main (v: f64[2]) -> f64[] {
     assert count_kernels(text, inside=False) == (2 + 3 * 2 + 1, 1)
 
 
+@pytest.mark.slow
 def test_branches_and_a_loop_without_a_count():
     """Five rounds of (1 + 1), and the longer of two branches; without the five no number."""
     text = """

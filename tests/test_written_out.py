@@ -30,6 +30,9 @@ PRODUCTS = {
     "bcij,bcj->bci": ((2, 3, 4, 5), (2, 3, 5)),
 }
 
+#: In the default suite: of one vector, of matrices in a batch.
+FEW = ("i,i->", "bij,bjk->bik")
+
 
 def numbers(*shapes, dtype="float64"):
     rng = np.random.default_rng(3)
@@ -43,7 +46,7 @@ def names(jaxpr):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("what", PRODUCTS)
+@pytest.mark.parametrize("what", [*FEW, *late(*(n for n in PRODUCTS if n not in FEW))])
 def test_a_product_is_that_of_numpy(what, dtype):
     a, b = numbers(*PRODUCTS[what], dtype=dtype)
     sums = written_out(jax.make_jaxpr(functools.partial(jnp.einsum, what))(a, b))
