@@ -153,7 +153,7 @@ ROWS = {
     ),
     "duffing": Row(
         lambda v: (duffing(v["d"], _law(v)),),
-        {"d": np.array([0.3, 1.2]), "k_1": 0.3, "k_3": 0.1}, {"k_1": np.nan}, (),
+        {"d": np.array([0.0, 0.3, 1.2]), "k_1": 0.3, "k_3": 0.1}, {"k_1": np.nan}, (),
     ),
     "ring_weight": Row(
         lambda v: (ring_weight(v["s"], v["x"], v["t"]),), {"s": 27.2, "x": RINGS, "t": 5.0},
