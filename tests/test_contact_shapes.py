@@ -269,13 +269,13 @@ def test_nearest_rotation_is_the_polar_factor(dtype):
     axis = rng.normal(size=(60, 3))
     angle = np.r_[np.linspace(0, 2, 30), np.linspace(2, 2.65, 28), 3.1, np.pi]
     vector = axis / np.linalg.norm(axis, axis=1, keepdims=True) * angle[:, None]
-    turns = jax.vmap(lambda w: pose_from_vector(w, jnp.zeros(3)).rotation)
+    turns = jax.jit(jax.vmap(lambda w: pose_from_vector(w, jnp.zeros(3)).rotation))
     start = np.asarray(turns(jnp.asarray(rng.normal(size=(60, 3)))))
     share = np.r_[rng.uniform(size=20), np.full(40, 0.5)][:, None, None]
     mean = (1 - share) * start + share * (start @ np.asarray(turns(jnp.asarray(vector))))
     found = jax.jit(jax.vmap(nearest_rotation))(jnp.asarray(mean, dtype), jnp.asarray(start, dtype))
+    found, eps = np.asarray(found), np.finfo(dtype).eps
     assert found.dtype == dtype
-    eps = np.finfo(dtype).eps
     for i in range(58):
         known = scipy.linalg.polar(mean[i])[0]
         error = np.abs(np.asarray(found[i], float) - known).max()
@@ -310,7 +310,7 @@ def test_matrices_that_are_no_rotations_are_refused(name):
 def test_rotations_pass_rounded_to_float32_and_after_many_products():
     """Whatever is not finite is left to a status."""
     q = np.random.default_rng(0).normal(size=(200, 4))
-    turns = jax.vmap(lambda q: pose_from_quaternion(q, jnp.zeros(3)).rotation)
+    turns = jax.jit(jax.vmap(lambda q: pose_from_quaternion(q, jnp.zeros(3)).rotation))
     for dtype in (np.float32, np.float64):
         R = np.asarray(turns(jnp.asarray(q, dtype)), dtype)
         product = np.eye(3, dtype=dtype)

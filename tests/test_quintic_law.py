@@ -123,6 +123,7 @@ def test_total_has_the_fold_of_the_law():
     assert fold_depth(law((0.5, -0.08, 0.012))) == jnp.inf
     D = jnp.asarray([0.4, -3.0])
     free = total(D, number(0.0), law((0.5, -0.08, 0.012)))
+    D = np.asarray(D)
     np.testing.assert_allclose(free.force, 0.5 * D - 0.08 * D**3 + 0.012 * D**5, rtol=1e-14)
     folded = press_vector_total(jnp.asarray([0.0, 1.3, 0.0]), jnp.zeros((3, 3)), law(k))
     assert folded.status == past

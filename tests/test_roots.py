@@ -89,9 +89,8 @@ def test_cubic_ratio_derivatives(u):
 
 def test_cubic_ratio_maps_row_by_row():
     """A NaN row leaves the bits of its neighbours alone."""
-    good = jnp.asarray([0.1, 7.0, -0.5, 1e20])
-    bad = good.at[1].set(jnp.nan)
-    one, two = jax.vmap(cubic_ratio)(good), jax.vmap(cubic_ratio)(bad)
+    run = jax.jit(jax.vmap(cubic_ratio))
+    one, two = (np.asarray(run(np.array([0.1, v, -0.5, 1e20]))) for v in (7.0, np.nan))
     keep = np.array([0, 2, 3])
     np.testing.assert_array_equal(one[keep], two[keep])
     assert np.isnan(two[1])

@@ -214,13 +214,14 @@ def test_bad_lanes_stay_alone():
 def test_total():
     """As printed: the law takes all of D; the skeleton may then outrun the tool."""
     D, local = np.array([0.3, -0.4, 0.0]), law(0.2, 0.4)
-    got = press_vector_total(*cast("float64", D, C_FULL), local)
+    run = jax.jit(press_vector_total)
+    got = run(*cast("float64", D, C_FULL), local)
     np.testing.assert_allclose(got.force, (0.2 + 0.4 * 0.25) * D, rtol=1e-14)
     # The third is 0 by cancellation: to the rounding of what cancels.
-    met = got.depth + C_FULL @ got.force
+    met = np.asarray(got.depth) + np.asarray(C_FULL) @ np.asarray(got.force)
     np.testing.assert_allclose(met, D, rtol=1e-14, atol=np.finfo(float).eps * np.abs(D).max())
-    outrun = press_vector_total(*cast("float64", 5 * D, C_FULL), local)
+    outrun = run(*cast("float64", 5 * D, C_FULL), local)
     assert outrun.status == PressStatus.NEGATIVE_LOCAL
-    folded = press_vector_total(*cast("float64", 5 * D, C_FULL), law(0.2, -0.4))
+    folded = run(*cast("float64", 5 * D, C_FULL), law(0.2, -0.4))
     assert folded.status == PressStatus.PAST_FOLD
     assert np.all(np.isnan(folded.force))

@@ -144,6 +144,6 @@ def test_a_round_tool_rests_on_the_ring():
     d = np.minimum(s - 20, 30 - s)
     moved = 5 * (d / 5) ** 3
     np.testing.assert_allclose(got, np.where(s <= 25, 20 + moved, 30 - moved), atol=1e-12)
-    slope = jax.vmap(jax.grad(effective_place, (0, 3)), (0, None, None, None))
+    slope = jax.jit(jax.vmap(jax.grad(effective_place, (0, 3)), (0, None, None, None)))
     for exponent in (1.0, 3.0):
         assert np.all(np.isfinite(slope(jnp.asarray(s), *ends, jnp.asarray(exponent))))

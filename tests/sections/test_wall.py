@@ -162,7 +162,8 @@ def test_many_sections_at_once():
     q, phi_c = jnp.asarray(np.random.default_rng(4).normal(size=(2, 3, 4))), jnp.asarray(0.0)
     s, same = jnp.asarray([0.0, 5.0, 9.0, 5.0]), jnp.full(4, 0.4)
     points, modes = around(gather_points(s, same, same + 11), *SHAPE), WallModes(q, 0.1 * q)
-    both = jax.jit(jax.vmap(lambda m: wall_motion(m, points, phi_c, *SHAPE)))(modes)
+    run = jax.jit(jax.vmap(lambda m: wall_motion(m, points, phi_c, *SHAPE)))
+    both = np.asarray(run(modes))
     for i in range(2):
         alone = move(jax.tree.map(lambda v, i=i: v[i], modes), points, phi_c, *SHAPE)
         np.testing.assert_allclose(both[i], alone, atol=1e-13)
