@@ -95,8 +95,8 @@ def test_compliances_of_other_skeletons_are_quick_for_few_lanes_only(lanes, quic
     study = synthetic.study(synthetic.forces(truth)[0])
     seen = []
 
-    def watched(function, study, theta, *, batch, rows, quick):
-        seen.append((len(theta) <= batch, quick))
+    def watched(function, study, theta, *, batch, rows, unoptimised):
+        seen.append((len(theta) <= batch, unoptimised))
         return np.ones((len(theta), other_starts.TOGETHER, 4))
 
     monkeypatch.setattr(other_starts, "map_lanes", watched)

@@ -34,7 +34,7 @@ def wrong(outcomes):
 
 def test_quick_functions():
     rows = [c for c in CASES if c.function in QUICK]
-    assert not wrong(run_table(rows, TRUTHS, table.DTYPES, quick=True))
+    assert not wrong(run_table(rows, TRUTHS, table.DTYPES, unoptimised=True))
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_every_kind_of_fault_is_seen():
         dataclasses.replace(case, name="truth"),
     ]
     truths = {case.name: truth, "value": far, "gradient": steep, "status": truth}
-    found = {o.case: o for o in run_table(rows, truths, ["float64"], quick=True)}
+    found = {o.case: o for o in run_table(rows, truths, ["float64"], unoptimised=True)}
     assert [o.case for o in wrong(found.values())] == [r.name for r in rows[1:]]
     assert found["value"].value > 1 >= found["value"].gradient
     assert found["gradient"].gradient > 1 >= found["gradient"].value
