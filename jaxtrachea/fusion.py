@@ -1,9 +1,4 @@
-"""Small parts of a large program, which XLA for CPUs is to run in order, or as a single kernel.
-
-It runs a computation in order where every array has at most 512 bytes, or where there are at most
-eight kernels. Else it keeps a graph and a queue of what is ready: for hundreds of small kernels
-that takes half as long again as they do. One large array (a surface) is enough for that, unless the
-small part is a computation of its own: `in_order`.
+"""Parts of a program that XLA for CPUs is to run as a single kernel, or one lane after the other.
 
 Starting a kernel takes as long as some hundred operations. What XLA makes of its own small loops
 can be asked for: the whole part in one function, with loops and branches, `fuse`. That is for
@@ -11,6 +6,8 @@ parts whose arrays are small: one thread works through them. A kernel calls no l
 scatter: a product of matrices is written as a sum (`_numerics.product`, `turned`; of a part that is
 also called in batches by `_written_out`), a choice by place as a sum of choices (`picked`), the
 lowest of many found one by one (`lowest`).
+
+A mark stays where it makes a row of the mission 1.3 times as fast (tests/bench/marks.py).
 
 With the environment variable `JAXTRACHEA_ONE_KERNEL` set to 0 there are no single kernels: for
 programs that are exported to another version of jaxlib, or should a compiler refuse one.
@@ -38,28 +35,11 @@ from jaxtrachea._written_out import written_out
 
 Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
-MARKS = "not_inlined", "one_kernel", "hidden"
+MARKS = "one_kernel", "hidden"
 #: Versions of jaxlib whose compiler was seen to do `fuse` right (tests/test_fusion.py). A
 #: compiler that cannot put a part into one kernel refuses the program or ends the process: with
-#: others it is as `in_order`.
+#: others the part is compiled as it stands.
 SUPPORTED_JAXLIB = ("0.10.2", "0.11.2", "0.12.0.1")
-
-
-def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
-    """The same function, compiled as a computation of its own: one pose at a time, on a CPU.
-
-    Many lanes at once (`vmap` over an argument), on another device, or with a JAX that cannot mark
-    a call, it is compiled into the program around it as if this were not here; all results of a
-    batch have lanes, also one that is the same in all. Values and derivatives are the same, but for
-    rounding. Derivatives are computations of their own too, and begin with the part once more: for
-    small parts that is quicker than to keep in memory what they need of it. Forward and reverse
-    mode, each as often as wanted (with a `custom_vjp` inside, reverse mode once);
-    `jax.linear_transpose` by itself does not know these calls.
-
-    Args:
-        part: from arrays to arrays (or trees of them); may close over traced ones.
-    """
-    return _called(part, _in_order)
 
 
 def fuse(part: Callable[..., Out], *, products: bool = False) -> Callable[..., Out]:
@@ -70,7 +50,7 @@ def fuse(part: Callable[..., Out], *, products: bool = False) -> Callable[..., O
     those of `SUPPORTED_JAXLIB` gets the function as it is. Not where it does what `FITTING` lacks
     (products of matrices, but see `products`; linear algebra, sorting with `top_k`, `.at[]`),
     reduces more than `REDUCED` entries, or has arrays that are not `SMALL` or not of numbers: that
-    is compiled as `in_order`.
+    is compiled as it stands.
     So it is with its derivatives, each by itself. Values and derivatives are the same but for
     rounding. A derivative begins with the part once more: of a batch it takes somewhat longer than
     that of the function by itself, so mark what is called one at a time.
@@ -85,29 +65,12 @@ def fuse(part: Callable[..., Out], *, products: bool = False) -> Callable[..., O
     return _called(part, _kernel_of_products if products else _kernel)
 
 
-def fuse_batch(part: Callable[..., Out]) -> Callable[..., Out]:
-    """The same function; many lanes together (`vmap`) are a single kernel, on a CPU.
-
-    For parts of many small steps, a sweep over the rings say, where `fuse` is for one call:
-    of some hundred lanes each step is still a small kernel. Arrays of all lanes together are to be
-    `SMALL`, sums of `REDUCED` entries, and nothing else than `fuse` can do; otherwise, with
-    another compiler, and for one call, the function is as it is. Take derivatives inside the part,
-    one after the other (`jax.jvp`, not under `vmap`, which breaks the lanes into short rows): those
-    taken from outside are calls of their own, which begin with the part once more; twice backwards
-    through a loop only from JAX 0.11 on.
-
-    Args:
-        part: from arrays to arrays (or trees of them); may close over traced ones.
-    """
-    return _called(part, _kernel_of_lanes)
-
-
 def map_sequentially(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function; of many lanes (`vmap`), on a CPU, one lane after the other.
 
     For parts that are a large array and go through it several times: those of many lanes are out of
     the cache before they are read again. A lane, on a CPU, is then as if there were no other:
-    `in_order` and `fuse` inside are what they say. Small arrays (`_linear.LARGE`) and other
+    `fuse` inside is what it says. Small arrays (`_linear.LARGE`) and other
     devices take all lanes together. Values and derivatives are the same but for rounding;
     derivatives begin with the part once more, and are taken in turn too; twice backwards through a
     loop only from JAX 0.11 on.
@@ -119,11 +82,11 @@ def map_sequentially(part: Callable[..., Out]) -> Callable[..., Out]:
 
 
 def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
-    """The part as a call of its own, made by `how`; `_in_order` where a kernel cannot hold it."""
+    """The part as a call of its own, made by `how`; as it is where a kernel cannot hold it."""
 
     def run(*arguments):
-        marked = how is not _in_turn
-        if (marked and _not_inlined_p is None) or not _traced(arguments):
+        kernel = how is not _in_turn
+        if (kernel and _one_kernel_p is None) or not _traced(arguments):
             return part(*arguments)
         closed, shape = jax.make_jaxpr(part, return_shape=True)(*arguments)
         if not closed.jaxpr.outvars:
@@ -151,12 +114,12 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
             return _changing(jaxpr, {variables[read[i]] for i in moving})
 
         inputs = [given[i] for i in read]
-        assessed = jaxpr
-        if how is _kernel_of_products:
-            assessed = written_out(jax.make_jaxpr(plain)(*inputs)).jaxpr
-        fits = _one_kernel_p is not None and fits_one_kernel(assessed)
-        refused = how in (_kernel, _kernel_of_products) and not fits
-        found = _differentiable(plain, changing, _in_order if refused else how)(*inputs)
+        if kernel:
+            products = how is _kernel_of_products
+            alone = written_out(jax.make_jaxpr(plain)(*inputs)).jaxpr if products else jaxpr
+            if not fits_one_kernel(alone):
+                return part(*arguments)
+        found = _differentiable(plain, changing, how)(*inputs)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return run
@@ -187,8 +150,8 @@ def _differentiable(plain: Callable, changing_with: Callable, how: Callable) -> 
     Args:
         plain: from arrays to a list of arrays; what it closes over is not traced.
         changing_with: from the places of arrays to those of the results that change with them.
-        how: `_in_order`, `_kernel`, `_kernel_of_products`, `_kernel_of_lanes` or `_in_turn`; so
-            are its derivatives then, if they can be.
+        how: `_kernel`, `_kernel_of_products` or `_in_turn`; so are its derivatives then, if they
+            can be.
     """
 
     @jax.custom_jvp
@@ -230,35 +193,25 @@ def _differentiable(plain: Callable, changing_with: Callable, how: Callable) -> 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Way:
-    """What a part does, and how the call is marked; "": compiled into the program around it."""
+    """What a part does, and whether it is a kernel or compiled into the program around it."""
 
     closed: ClosedJaxpr
-    mark: str
+    kernel: bool
 
     def plain(self, *inputs) -> list:
         return jaxpr_as_fun(self.closed)(*inputs)
 
 
-def _in_order(plain: Callable, inputs) -> list:
-    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), mark=MARKS[0]))
-
-
 def _kernel(plain: Callable, inputs) -> list:
-    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), mark=MARKS[1]))
+    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), kernel=True))
 
 
 def _marked(*inputs, way: _Way) -> list:
     """What a part is lowered to on a CPU: a call with a mark on its first result."""
-    plain = way.plain
-    if way.mark == MARKS[0]:
-        leaves = list(jax.jit(plain)(*inputs))
-        # One that is used is enough: what is marked is the call that it comes from.
-        leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
-        return leaves
 
     def whole(*inputs):
         read = [jnp.ravel(v)[0] for v in inputs]
-        return list(plain(*inputs)), jnp.stack([jnp.asarray(v, jnp.float32) for v in read])
+        return list(way.plain(*inputs)), jnp.stack([jnp.asarray(v, jnp.float32) for v in read])
 
     # The compiler ends the process over an input that a kernel does not read: constants are
     # hidden from it, which it would write into the part, and every input is read.
@@ -282,23 +235,6 @@ def _kernel_of_products(plain: Callable, inputs) -> list:
             out = [v[None] for v in alone(*one)]
         else:
             out = jax.vmap(plain, [0 if lanes else None for lanes in has_lanes])(*inputs)
-        return out, [True] * len(out)
-
-    return alone(*inputs)
-
-
-def _kernel_of_lanes(plain: Callable, inputs, *, lanes: bool = False) -> list:
-    @custom_vmap
-    def alone(*inputs):
-        kernels = lanes and _one_kernel_p is not None
-        if kernels and fits_one_kernel(jax.make_jaxpr(plain)(*inputs).jaxpr):
-            return _kernel(plain, inputs)
-        return list(plain(*inputs))
-
-    @alone.def_vmap
-    def _(_, has_lanes, *inputs):
-        mapped = jax.vmap(plain, [0 if own else None for own in has_lanes])
-        out = _kernel_of_lanes(lambda *lanes: list(mapped(*lanes)), inputs, lanes=True)
         return out, [True] * len(out)
 
     return alone(*inputs)
@@ -414,7 +350,7 @@ def _evaluated(*inputs, way: _Way) -> list:
 
 def _lowered(context, *inputs, way: _Way):
     on_cpu = tuple(context.module_context.platforms) == ("cpu",)
-    if not (on_cpu and way.mark):
+    if not (on_cpu and way.kernel):
         return mlir.lower_fun(way.plain, multiple_results=True)(context, *inputs)
     call = functools.partial(_marked, way=way)
     return mlir.lower_fun(call, multiple_results=True)(context, *inputs)
@@ -432,7 +368,7 @@ def _lanes(inputs, axes, *, way: _Way):
         found = [v[None] for v in _part_p.bind(*one, way=way)]
     else:
         closed = jax.make_jaxpr(jax.vmap(way.plain, in_axes=axes))(*inputs)
-        found = _part_p.bind(*inputs, way=_Way(closed, mark=""))
+        found = _part_p.bind(*inputs, way=_Way(closed, kernel=False))
     return found, [0] * len(found)
 
 
@@ -463,7 +399,7 @@ def _without_unread(used: list[bool], *rest):
     return reads, eqn.replace(
         invars=[v for v, read in zip(eqn.invars, reads, strict=True) if read],
         outvars=[v for v, read in zip(eqn.outvars, used, strict=True) if read],
-        params={"way": _Way(ClosedJaxpr(jaxpr, way.closed.consts), way.mark)},
+        params={"way": _Way(ClosedJaxpr(jaxpr, way.closed.consts), way.kernel)},
     )
 
 
@@ -498,7 +434,6 @@ def _all_read(x, *rest):
     return jax.lax.optimization_barrier((x, *rest))[0]
 
 
-_not_inlined_p = _mark(MARKS[0], _told(inlineable="false"))
 _one_kernel_p = _hidden_p = None
 if (
     jaxlib.version.__version__ in SUPPORTED_JAXLIB
@@ -506,6 +441,6 @@ if (
 ):
     _small_call = _told(inlineable="false", xla_cpu_small_call="true")
     _one_kernel_p = _mark(
-        MARKS[1], lambda x, read, *_: _all_read(_small_call(x), _small_call(read))
+        MARKS[0], lambda x, read, *_: _all_read(_small_call(x), _small_call(read))
     )
-    _hidden_p = _mark(MARKS[2], lambda x, *_: jax.lax.optimization_barrier(x))
+    _hidden_p = _mark(MARKS[1], lambda x, *_: jax.lax.optimization_barrier(x))

@@ -30,7 +30,7 @@ from jaxtrachea import (
 )
 from jaxtrachea._numerics import epsilon, largest
 from jaxtrachea.contact.shapes import capsule
-from jaxtrachea.fusion import fuse, fuse_batch, in_order
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.scene.deform import _sag
@@ -39,8 +39,6 @@ DTYPES = [*late("float32"), "float64"]
 NOT_INLINED = 'inlineable="false"'
 #: With the first word: XLA makes calls of its own small loops.
 ONE = f'{NOT_INLINED},xla_cpu_small_call="true"'
-BOTH = pytest.mark.parametrize("mark", [in_order, fuse])
-ALL = pytest.mark.parametrize("mark", [in_order, fuse, fuse_batch])
 pytestmark = [pytest.mark.usefixtures("on_the_cpu"), pytest.mark.compiling]
 
 
@@ -111,13 +109,13 @@ WAYS = {
         lambda *v: total(jax.checkpoint(f), *v), argnums=(0, 1)
     )(*v),
     "linearize": lambda f, *v: jax.linearize(f, *v)[1](*v),
-    "closure": lambda f, x, y: jax.jacrev(lambda t: in_order_or(f)(lambda w: part(t, w))(y))(x),
+    "closure": lambda f, x, y: jax.jacrev(lambda t: fuse_or(f)(lambda w: part(t, w))(y))(x),
 }  # fmt: skip
 
 
-def in_order_or(f):
-    """`in_order` again if f is marked, else the identity."""
-    return (lambda g: g) if f is part else in_order
+def fuse_or(f):
+    """`fuse` again if f is marked, else the identity."""
+    return (lambda g: g) if f is part else fuse
 
 
 LANES = {
@@ -156,11 +154,10 @@ def arguments(lanes, dtype):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("way", list(WAYS))
-@ALL
-def test_it_is_the_part(mark, way, dtype):
+def test_it_is_the_part(way, dtype):
     """Alone, and one or many lanes, in the same program and one operation after the other."""
     do = WAYS[way]
-    marked = mark(part)
+    marked = fuse(part)
     close(do(marked, *numbers(dtype)), do(part, *numbers(dtype)))
     chosen = list(LANES) if way in ("value", "jacrev") else ["none", "many", "second argument"]
     for lanes in chosen:
@@ -183,8 +180,7 @@ SHARED = {
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("lanes", list(SHARED))
-@BOTH
-def test_derivatives_of_a_program_of_lanes(mark, lanes, dtype):
+def test_derivatives_of_a_program_of_lanes(lanes, dtype):
     """Taken from outside of `jit`, where a result is the same in all lanes."""
     way, first, second = SHARED[lanes]
     at = numbers(dtype, first)[0], numbers(dtype, second)[1]
@@ -194,13 +190,12 @@ def test_derivatives_of_a_program_of_lanes(mark, lanes, dtype):
         slope = jax.grad(functools.partial(total, mapped), argnums=(0, 1))
         return jax.jvp(mapped, at, at), slope(*at)
 
-    close(ways(mark(part)), ways(part))
+    close(ways(fuse(part)), ways(part))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
-@BOTH
-def test_second_derivatives_of_a_loop(mark, dtype):
+def test_second_derivatives_of_a_loop(dtype):
     """By a result that is not the first, twice backwards: JAX takes the loop apart."""
     x, y = numbers(dtype)
 
@@ -210,18 +205,17 @@ def test_second_derivatives_of_a_loop(mark, dtype):
 
         return jax.jit(jax.jacrev(jax.grad(of)))(x)
 
-    close(slopes(mark(part)), slopes(part))
+    close(slopes(fuse(part)), slopes(part))
 
 
 @pytest.mark.slow
-@BOTH
-def test_a_loop_takes_no_part_apart(mark):
+def test_a_loop_takes_no_part_apart():
     """What a part computes of constants alone stays in it.
 
     Out of it, it would be an operand, of those that a kernel need not read: the compiler ended the
     process over the gradient of a loop over scenes.
     """
-    marked = mark(lambda x, y: (jnp.sum(jnp.cos(jnp.arange(5.0)) * x) * y, y * x))
+    marked = fuse(lambda x, y: (jnp.sum(jnp.cos(jnp.arange(5.0)) * x) * y, y * x))
 
     def loss(y):
         found = jax.lax.map(lambda x: marked(x, y), jnp.linspace(1.0, 2, 3))
@@ -235,7 +229,7 @@ def test_a_loop_takes_no_part_apart(mark):
 
 def test_the_derivative_by_hand():
     """d/dx of x sin(x) at 0.7, once and twice."""
-    marked, x = in_order(lambda x: (x * jnp.sin(x),)), jnp.asarray(0.7)
+    marked, x = fuse(lambda x: (x * jnp.sin(x),)), jnp.asarray(0.7)
     slope = jax.jit(jax.grad(lambda x: marked(x)[0]))
     np.testing.assert_allclose(slope(x), np.sin(0.7) + 0.7 * np.cos(0.7), rtol=1e-14)
     np.testing.assert_allclose(jax.grad(slope)(x), 2 * np.cos(0.7) - 0.7 * np.sin(0.7), rtol=1e-14)
@@ -252,7 +246,7 @@ def test_a_first_result_without_a_derivative(first, dtype):
         return found, x[n] ** 3
 
     x, n = numbers(dtype)[0], jnp.asarray(1)
-    for f in (lead, in_order(lead)):
+    for f in (lead, fuse(lead)):
         got = jax.jit(f)(x, n)
         close(got, lead(x, n))
         slope = jax.jit(jax.grad(lambda x, f=f: f(x, n)[1]))(x)
@@ -265,76 +259,24 @@ def test_a_first_result_without_a_derivative(first, dtype):
 
 @pytest.mark.slow
 def test_no_results_and_no_arguments():
-    assert jax.jit(in_order(lambda x: (None, ())))(jnp.ones(3)) == (None, ())
-    assert in_order(lambda: 3)() == 3  # nothing traced: the part itself, not through JAX
-    assert jax.jit(lambda x: in_order(lambda: x + 1)())(jnp.ones(())) == 2
+    assert jax.jit(fuse(lambda x: (None, ())))(jnp.ones(3)) == (None, ())
+    assert fuse(lambda: 3)() == 3  # nothing traced: the part itself, not through JAX
+    assert jax.jit(lambda x: fuse(lambda: x + 1)())(jnp.ones(())) == 2
 
 
 @pytest.mark.slow
 def test_linear_parts_are_transposed():
     x, y = numbers("float64")
-    f = in_order(lambda v: (2 * v, x * v[::-1]))
+    f = fuse(lambda v: (2 * v, x * v[::-1]))
     got = jax.vjp(f, y)[1]((x, y))
     np.testing.assert_allclose(got[0], 2 * x + (x * y)[::-1], rtol=1e-15)
     # The marked result does not depend on what it is linear in.
-    got = jax.vjp(lambda v: in_order(part_of_it)(x, v)[1], y)[1](x)
+    got = jax.vjp(lambda v: fuse(part_of_it)(x, v)[1], y)[1](x)
     np.testing.assert_allclose(got[0], (x * x)[::-1], rtol=1e-15)
 
 
 def part_of_it(x, v):
     return jnp.sin(x), x * v[::-1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_one_pose_calls_it_and_many_lanes_hold_it(dtype):
-    """In the compiled program; with lanes also where the first result has none of its own."""
-
-    def program(f, *at):
-        return jax.jit(f).lower(*at).compile().as_text()
-
-    marked, one = in_order(part), numbers(dtype)
-    assert NOT_INLINED not in program(part, *one)
-    text = program(marked, *one)
-    assert sum(" call(" in v and NOT_INLINED in v for v in text.split("\n")) == 1
-    for lanes in ("one", "many", "of lanes", "one of many", "many of one", "second argument"):
-        text = program(LANES[lanes](marked), *arguments(lanes, dtype))
-        assert (NOT_INLINED in text) == (lanes == "one"), lanes
-    # Lanes that only a closure brings are seen if the first result has them.
-    x, y = numbers(dtype, (8,))
-    text = program(jax.vmap(lambda x, y: in_order(lambda w: part(x, w))(y), (0, None)), x, y[0])
-    assert NOT_INLINED not in text
-    # With the value: a gradient alone does not use the result that is marked.
-    gradient = jax.value_and_grad(lambda x, y: total(marked, x, y))
-    assert NOT_INLINED in program(gradient, *one)
-    assert NOT_INLINED not in program(jax.vmap(gradient), x, y)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("missing", ["cacheable", "value", "module"])
-def test_an_older_jax_has_the_part_itself(missing, monkeypatch):
-    """Without what JAX 0.6 lacks, and without the module, nothing is marked and nothing fails."""
-    from jax.interpreters import mlir
-
-    def without_cacheable(primitive, rule, platform=None):
-        """As of JAX 0.6."""
-
-    def without_value(**attributes):
-        """As of JAX 0.6."""
-
-    if missing == "cacheable":
-        monkeypatch.setattr(mlir, "register_lowering", without_cacheable)
-    elif missing == "value":
-        monkeypatch.setattr("jax.experimental.xla_metadata.set_xla_metadata", without_value)
-    else:
-        monkeypatch.setitem(sys.modules, "jax.experimental.xla_metadata", None)
-    mark = fusion._mark("without", fusion._told(inlineable="false"))
-    assert mark is None
-    monkeypatch.setattr(fusion, "_not_inlined_p", mark)
-    x, y = numbers("float64")
-    marked = in_order(part)
-    close(jax.jit(marked)(x, y), part(x, y))
-    assert NOT_INLINED not in jax.jit(marked).lower(x, y).compile().as_text()
 
 
 def compiled(f, *at) -> str:
@@ -364,40 +306,6 @@ def test_one_kernel_is_one(dtype):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_many_lanes_in_one_kernel_are_one(dtype):
-    """Cube roots again, with their derivative a^(-2/3) / 3 from inside; of one lane not."""
-
-    def root(a):
-        def step(_, x):
-            return x - (x**3 - a) / (3 * x**2)
-
-        return jax.lax.fori_loop(0, 40, step, jnp.ones_like(a))
-
-    def part(a):
-        return jax.jvp(root, (a,), (jnp.ones_like(a),))
-
-    a = jnp.linspace(1, 27, 30, dtype=dtype)
-    marked = fuse_batch(part)
-    lanes = {1: a, 2: jnp.stack([a, 2 * a, 3 * a]), 3: jnp.stack([a, 2 * a])[None]}
-    for axes, at in lanes.items():
-        f, plain = marked, part
-        for _ in range(axes - 1):
-            f, plain = jax.vmap(f), jax.vmap(plain)
-        got, slope = jax.jit(f)(at)
-        np.testing.assert_allclose(got, np.cbrt(at), rtol=8 * epsilon(a.dtype))
-        np.testing.assert_allclose(slope, np.cbrt(at) ** -2 / 3, rtol=32 * epsilon(a.dtype))
-        text = compiled(f, at)
-        assert (ONE in text) == (axes > 1 and fusion._one_kernel_p is not None)
-        if ONE in text:
-            assert count_kernels(compiled(plain, at))[0] > 40
-            assert count_kernels(text, inside=False) == (1, 0)
-    # Of arrays that are not small it is not one.
-    many = jnp.broadcast_to(a, (fusion.SMALL // 30 + 1, 30))
-    assert ONE not in compiled(jax.vmap(marked), many)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", DTYPES)
 def test_derivatives_of_one_kernel_are_one_each(dtype):
     """Sum of y exp(-x^2): there, back, and back of what goes there, against calculus."""
     x, y = numbers(dtype, (100,))
@@ -423,22 +331,20 @@ def test_derivatives_of_one_kernel_are_one_each(dtype):
 
 
 @pytest.mark.slow
-@ALL
-def test_what_is_not_used_has_no_part_in_a_derivative(mark):
+def test_what_is_not_used_has_no_part_in_a_derivative():
     """The root has a slope without bound at 0, of which 0 times is no number."""
-    marked = mark(lambda x: (2 * x, jnp.sqrt(x)))
+    marked = fuse(lambda x: (2 * x, jnp.sqrt(x)))
     slope = jax.jit(jax.grad(lambda x: marked(x)[0]))
     assert slope(0.0) == 2
     assert jax.jit(jax.vmap(slope))(jnp.zeros(3)).tolist() == [2, 2, 2]
 
 
 @pytest.mark.slow  # all that lives is searched, often
-@BOTH
-def test_nothing_traced_is_kept(mark):
+def test_nothing_traced_is_kept():
     """A part that closes over what is traced, and its derivatives, once and twice."""
 
     def of(x):
-        return jnp.sum(mark(lambda v: jnp.sin(v) * x)(x * 2))
+        return jnp.sum(fuse(lambda v: jnp.sin(v) * x)(x * 2))
 
     x = jnp.arange(3.0)
     with jax.checking_leaks():
@@ -498,20 +404,13 @@ def test_inputs_that_one_kernel_does_not_read():
 
 
 @pytest.mark.slow
-def test_another_compiler_runs_it_in_order(monkeypatch):
+def test_another_compiler_has_the_part_itself(monkeypatch):
     """With a jaxlib that nobody has tried."""
     monkeypatch.setattr(fusion, "_one_kernel_p", None)
     x, y = numbers("float64")
     marked = fuse(part)
     close(jax.jit(marked)(x, y), part(x, y))
-    text = compiled(marked, x, y)
-    assert NOT_INLINED in text
-    assert ONE not in text
-    lanes, plain = (jax.vmap(f) for f in (fuse_batch(part), part))
-    at = numbers("float64", (4,))
-    for way in (lambda f: f, lambda f: lambda *v: jax.jvp(f, v, v)):
-        close(jax.jit(way(lanes))(*at), way(plain)(*at))
-    assert ONE not in compiled(lanes, *at)
+    assert ONE not in compiled(marked, x, y)
 
 
 @pytest.mark.slow
@@ -557,12 +456,11 @@ def test_what_is_not_numbers_is_not_in_one_kernel():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mark", [in_order, fuse])
-def test_programs_for_several_devices_have_no_marks(mark):
+def test_programs_for_several_devices_have_no_marks():
     """One text for all of them; for another device alone too."""
     x, y = numbers("float64")
     for devices in (("cpu", "cuda"), ("cuda",)):
-        text = jax.export.export(jax.jit(mark(part)), platforms=devices)(x, y).mlir_module()
+        text = jax.export.export(jax.jit(fuse(part)), platforms=devices)(x, y).mlir_module()
         assert "inlineable" not in text
         assert "small_call" not in text
 

@@ -22,7 +22,7 @@ from jaxtrachea import (
     table_1,
 )
 from jaxtrachea._numerics import epsilon
-from jaxtrachea.fusion import fuse, in_order, map_sequentially
+from jaxtrachea.fusion import fuse, map_sequentially
 from jaxtrachea.trachea.tube import make_tube
 
 DTYPES = ["float32", "float64"]
@@ -150,13 +150,13 @@ def test_other_devices_take_all_lanes_together():
     assert ["stablehlo.while" in t for t in texts] == [False, True]
 
 
-@pytest.mark.parametrize("mark", [in_order, fuse, map_sequentially])
+@pytest.mark.parametrize("mark", [fuse, map_sequentially])
 def test_what_is_not_read_is_not_computed(mark):
     """Of two results of a call, where a marked part reads one."""
     x = jnp.linspace(0, 1, 7)
 
     def run(x):
-        return mark(lambda pair: 2 * pair[0])(in_order(lambda x: (jnp.sqrt(x), jnp.cos(x)))(x))
+        return mark(lambda pair: 2 * pair[0])(fuse(lambda x: (jnp.sqrt(x), jnp.cos(x)))(x))
 
     compiled = jax.jit(run).lower(x).compile()
     np.testing.assert_allclose(compiled(x), 2 * np.sqrt(x), rtol=1e-6)

@@ -16,7 +16,6 @@ from jaxtrachea.fitting import forward_residual
 from jaxtrachea.fitting.lane import Lane, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import SKELETON
-from jaxtrachea.fusion import fuse_batch
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.levels.level import Closed, Motion
@@ -125,7 +124,7 @@ def residual_value(
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
     if model.level.closed is None:
         return forward_residual.residual_value(model, free, of_press(lane), tube)
-    skeleton = _skeleton_of_lanes(model, free, _places(lane), tube)
+    skeleton = _skeleton(model, free, _places(lane), tube)
 
     def one(free, skeleton, trial):
         at = _at_contact(model, free, trial.value, trial.s_c, tube)
@@ -206,9 +205,7 @@ def _skeleton_and_derivative(
 ) -> tuple[Skeleton, Skeleton]:
     """`_skeleton` and its derivative by each of `_beam_columns`, an axis after that of the trials.
 
-    A trial reads its own row of `free` alone, so that one tangent serves all trials. Compliances of
-    many lanes are one kernel with their derivatives, if it can hold them. With markers, a tool
-    with a width or on another device it cannot: then all columns go along together.
+    A trial reads its own row of `free` alone, so that one tangent serves all trials.
     """
     columns = _beam_columns(model)
     if not columns:
@@ -216,28 +213,11 @@ def _skeleton_and_derivative(
         return skeleton, jax.tree.map(lambda v: jnp.zeros((v.shape[0], 0, *v.shape[1:])), skeleton)
     along = np.eye(free.shape[1], dtype=free.dtype)[list(columns)]
 
-    def push(tangent, free, places):
+    def push(tangent):
         tangents = jnp.broadcast_to(tangent, free.shape)
         return jax.jvp(lambda free: _skeleton(model, free, places, tube), (free,), (tangents,))
 
-    if places.marked or model.options.half_width > 0 or jax.default_backend() != "cpu":
-        return jax.vmap(lambda t: push(t, free, places), out_axes=(None, 1))(along)
-
-    def pushed(free, s_c, value):
-        at = places._replace(s_c=s_c, value=value)
-        found = [push(jnp.asarray(t), free, at) for t in along]
-        return found[0][0], jax.tree.map(lambda *v: jnp.stack(v, 1), *(t for _, t in found))
-
-    return fuse_batch(pushed)(free, places.s_c, places.value)
-
-
-def _skeleton_of_lanes(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleton:
-    """`_skeleton`; of many lanes one kernel, if it can hold it."""
-
-    def at(free, s_c, value):
-        return _skeleton(model, free, places._replace(s_c=s_c, value=value), tube)
-
-    return fuse_batch(at)(free, places.s_c, places.value)
+    return jax.vmap(push, out_axes=(None, 1))(along)
 
 
 class _Contact(NamedTuple):

@@ -11,7 +11,7 @@ from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
-from jaxtrachea.fusion import fuse, map_sequentially
+from jaxtrachea.fusion import map_sequentially
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
@@ -171,9 +171,9 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
     radius = scene.radius if radius is None else radius
     if tool is None or scene.tool is None:
         # Rows may share the contact point: outside of a part, all of whose results have lanes.
-        where, share = centres(s_c, phi_c, radius), fuse(evenly)(depth)
+        where, share = centres(s_c, phi_c, radius), evenly(depth)
     else:
-        where, share = fuse(lay_out)(s_c, phi_c, radius, tool, depth)
+        where, share = lay_out(s_c, phi_c, radius, tool, depth)
     return local.fit(where, share[:, None], local.REACH * spacing, depth)
 
 

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._numerics import product, product_of_rows, total
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.pose import Pose, inverse, nearest_rotation, transform
-from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.stage import Poses, Scene, at_row
@@ -97,7 +96,7 @@ def landing(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> La
     chord = step - total(step * mean) / jnp.maximum(total(inward * mean), LEAST) * inward
     moved = share * chord - gap * inward
     way, frame = points - at_row(points, first)[None] + moved[None], axes_at(scene, s)
-    turned = fuse(nearest_rotation)(mix(path.rotation), at_row(path.rotation, first))
+    turned = nearest_rotation(mix(path.rotation), at_row(path.rotation, first))
     return Landing(
         s=s, phi=phi, point=mix(seen.point), body=body, rotation=turned,
         translation=at_row(points, first) - moved - product(turned, body), frame=frame,

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._linear import linear
 from jaxtrachea._numerics import added, epsilon, total
-from jaxtrachea.fusion import fuse, in_order
+from jaxtrachea.fusion import fuse
 
 #: Centres on circles round C, by the number of centres; the outermost circle is the collar.
 CIRCLES = {1: (), 8: (7,), 16: (6, 9), 32: (6, 10, 15)}
@@ -198,7 +198,7 @@ def fit(
 
         return jax.lax.custom_linear_solve(meet, targets, weigh, symmetric=True)
 
-    return Dent(centres, in_order(solve)(centres, targets, reach), reach, way)
+    return Dent(centres, solve(centres, targets, reach), reach, way)
 
 
 def correction(dent: Dent, points: Float[Array, "points 3"]) -> Float[Array, "points 3"]:

@@ -32,7 +32,6 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._arguments import check_word
 from jaxtrachea._linear import linear, replaced
 from jaxtrachea._numerics import added, epsilon, total
-from jaxtrachea.fusion import fuse, in_order
 from jaxtrachea.surface import phong
 from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
 from jaxtrachea.trachea.geometry import Geometry
@@ -186,11 +185,8 @@ def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
     Returns:
         The weights; NaN if C lies behind the ends of the rings.
     """
-
-    def share(*given):
-        return jnp.stack(_shares(*given))
-
-    return Weights(fuse(share)(binding.phi, phi_c, binding.half_angle), phi_c)
+    shares = _shares(binding.phi, phi_c, binding.half_angle)
+    return Weights(jnp.stack(shares), phi_c)
 
 
 @jax.custom_jvp
@@ -293,8 +289,7 @@ def _carry(binding: Binding, weights: Weights, s_c, joints, contact, U, V, slope
         shares = weights.U, weights.J, weights.V
         return _combine(shares, binding.fraction, binding.s, beyond, rows)
 
-    patches = fuse(lines)(s_c, joints, contact, U, V, slopes)
-    return in_order(across)(weights, s_c, patches)
+    return across(weights, s_c, lines(s_c, joints, contact, U, V, slopes))
 
 
 def _ends(values, s_c):
