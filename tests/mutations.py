@@ -98,7 +98,7 @@ ROWS = {
         ("alike-residuals", "fitting/effective.py",
          "return (1 - r) / (1 + r)", "return (1 - r) / (1 + r * r)",
          "test_reports.py::test_independent_residuals_widen_nothing"),
-        ("curve-weights", "fitting/curve_noise.py",
+        ("curve-weights", "fitting/noise.py",
          "for v in (count * sigma**2, count))", "for v in (count * sigma, count))",
          "test_record_faults.py::test_uneven_noise_and_its_weights"),
         ("share-likelihood", "fitting/force_share.py",

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from jaxtrachea.cli import specification
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.joint_information import held_count, unknown_count
+from jaxtrachea.fitting.information import held_count, unknown_count
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings

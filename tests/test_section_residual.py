@@ -11,7 +11,7 @@ import pytest
 
 from jaxtrachea.cli.specification import options_of, parameters_of
 from jaxtrachea.config import SpecError, load_fit_spec
-from jaxtrachea.fitting import joint_information, shared, structure
+from jaxtrachea.fitting import information, shared, structure
 from jaxtrachea.fitting.effective import effective_samples
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.information import Information
@@ -378,11 +378,11 @@ def test_noise_of_a_joint_fit_is_of_all_forces(monkeypatch):
     lane = study.lanes
     row = np.full((2, 1, size(lane)), 5.0)
     row[..., : force_entries(lane)] = [1.0] * 3 + [3.0] * 3
-    monkeypatch.setattr(joint_information, "map_lanes", lambda *_, **__: row)
+    monkeypatch.setattr(information, "map_lanes", lambda *_, **__: row)
     one, two, P = np.ones(2), np.ones((2, 2)), study.size
     none = np.zeros((2, P, P))
     info = Information(none, none, np.zeros((2, P)), *[two] * 5, one)
-    found = joint_information.pooled(study, info, np.zeros((2, P)), one > 0)
+    found = information.pooled(study, info, np.zeros((2, P)), one > 0)
     np.testing.assert_array_equal(found.spread, [[2.0, 5.0]] * 2)
 
 

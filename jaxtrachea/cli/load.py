@@ -72,7 +72,7 @@ def _with_depths(measurements, study, printed: set[str]):
     Nothing is fitted yet: a sought onset is taken where its curve shows it.
     """
     from jaxtrachea.fitting.onset import counted_from
-    from jaxtrachea.fitting.validated_depth import deeper_than_validated
+    from jaxtrachea.fitting.refusals import deeper_than_validated
 
     model = study.model
     curves = [c for lane in study.curves for c in lane]

@@ -162,7 +162,7 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.table import Table
-    from jaxtrachea.fitting.unused_observations import as_read
+    from jaxtrachea.fitting.refusals import as_read
     from jaxtrachea.prediction import report, tables
     from jaxtrachea.prediction.held_out import compare, pressable
     from jaxtrachea.prediction.plots import draw_compared

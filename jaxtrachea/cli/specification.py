@@ -7,10 +7,9 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held, in_model, visible
-from jaxtrachea.fitting.refusals import Refusal, Size, refusal
+from jaxtrachea.fitting.refusals import Refusal, Size, as_read, refusal
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
-from jaxtrachea.fitting.unused_observations import as_read
 from jaxtrachea.fitting.zeros import without_line, zeros_of
 from jaxtrachea.inference.together import left_out_together
 from jaxtrachea.measurements.read import (

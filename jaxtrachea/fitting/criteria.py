@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fitting.information import Information
-from jaxtrachea.fitting.joint_information import unknown_count
+from jaxtrachea.fitting.information import Information, unknown_count
 from jaxtrachea.fitting.lane import forces, markers, peaks
 from jaxtrachea.fitting.study import Study
 

@@ -6,15 +6,15 @@ elsewhere.
 """
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxtrachea.fitting.minima import Minima
-from jaxtrachea.fitting.natural_sizes import natural_sizes
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.parameters import OF_THE_PRESS, SKELETON
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.structure import positions
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.mechanics.force_law import coefficient, power
 from jaxtrachea.status import FitStatus
 
 #: Relative standard error along a direction, and condition number, from which there is doubt about
@@ -116,3 +116,28 @@ def barely_determined(study: Study) -> Bool[np.ndarray, " lanes"]:
     marked = study.lanes.joint_precision
     seen = np.zeros(len(count), bool) if marked is None else (marked > 0).any(axis=(1, 2, 3))
     return (positions(study) <= count + 1) & (count > 1) & ~seen
+
+
+def natural_sizes(result: FitResult) -> Float[np.ndarray, "L P"]:
+    """Change of each scaled coordinate that matters to the curves as a change of 100 % would.
+
+    As `FitResult.relative`, but no smaller than the press itself for what may be zero: an onset
+    against the deepest displacement from first touch, an offset against the largest force, a
+    coefficient k_n of the local law against that force over the depth to the power n.
+    """
+    lanes, out = result.study.lanes, result.relative.copy()
+    seen = lanes.precision > 0
+    force = np.where(seen, np.abs(lanes.force), 0).max(axis=(1, 2))
+    depth = np.abs(lanes.displacement - result.first_touch[..., None])
+    depth = np.where(seen, depth, 0).max(axis=(1, 2))
+    depth = np.where(depth > 0, depth, 1)
+    sizes = {"onset": depth, "force_offset": force, "force_slope": force / depth}
+    law = [p.name for p in result.study.free if coefficient(p.name)]
+    sizes |= {name: force / depth ** power(name) for name in law if power(name) > 1}
+    for column, p in enumerate(result.study.free):
+        if p.scale == "linear" and p.name in sizes:
+            lane, unknown = np.nonzero(result.study.unknown_columns == column)
+            own = sizes[p.name][lane] / p.step
+            before = out[lane, unknown]
+            out[lane, unknown] = np.where(own > before, own, before)  # NaN takes no place
+    return out

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import stdtrit
 
-from jaxtrachea.fitting.joint_information import held_count, unknown_count
+from jaxtrachea.fitting.information import held_count, unknown_count
 from jaxtrachea.fitting.misfit import Residuals, misfit
 from jaxtrachea.fitting.predictions import Prediction
 

@@ -11,7 +11,7 @@ from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.doubt import doubtful, left_in_doubt
 from jaxtrachea.fitting.evaluate import evaluated
 from jaxtrachea.fitting.force_share import MAX_ITERATIONS, changed, next_levels, with_levels
-from jaxtrachea.fitting.joint_information import held_count, marginal, summed_gradient
+from jaxtrachea.fitting.information import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
     information_per_lane,

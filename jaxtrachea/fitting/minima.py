@@ -10,8 +10,7 @@ from jaxtyping import Float
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.few_samples import few_samples, same_ends, serves
-from jaxtrachea.fitting.information import Information, informations
-from jaxtrachea.fitting.joint_information import pooled, unknown_count
+from jaxtrachea.fitting.information import Information, informations, pooled, unknown_count
 from jaxtrachea.fitting.lane import data_weight
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
 from jaxtrachea.fitting.settings import Settings

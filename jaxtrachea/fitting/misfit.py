@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import chdtr, chdtrc
 
-from jaxtrachea.fitting.joint_information import held_count, unknown_count
+from jaxtrachea.fitting.information import held_count, unknown_count
 from jaxtrachea.fitting.lane import Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.study import Study

@@ -1,15 +1,20 @@
-"""Curves that a model cannot press: refused with specimen, trial, reason and cure."""
+"""Curves that a model cannot press, or not deeper than tested; what of a curve it does not read."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.parameters import OF_THE_PRESS, Parameter
+from jaxtrachea.measurements.observed import VECTORS, WITHOUT_VECTORS
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.vectors import observed
 from jaxtrachea.mechanics.levels.choose import level_of
-from jaxtrachea.mechanics.levels.level import Size
+from jaxtrachea.mechanics.levels.level import Level, Size
+from jaxtrachea.mechanics.levels.line import VALIDATED_DEPTH
 from jaxtrachea.mechanics.levels.options import Options
 
 
@@ -134,3 +139,95 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
             cure="use force_sign = -1 and displacement_sign = -1 where the file counts compression "
             "negative, contact = 'bonded' where it pulls, or fit the onset",
         )
+
+
+def as_read(curves: Sequence[Curve], level: Level) -> tuple[Sequence[Curve], str | None]:
+    """Curves as a level reads them: without vectors where it presses along the normal alone.
+
+    Args:
+        curves: that the level admits.
+        level: of the model.
+
+    Returns:
+        The curves without their vectors, and a sentence on what was left out; None: nothing was.
+    """
+    if level.off_midline:
+        return curves, None
+    counts = {name: sum(observed(c, name) for c in curves) for name in VECTORS}
+    counts = {name: count for name, count in counts.items() if count}
+    plain = [
+        dataclasses.replace(c, **WITHOUT_VECTORS)
+        if any(getattr(c, name) is not None for name in WITHOUT_VECTORS)
+        else c
+        for c in curves
+    ]
+    if not counts:
+        return plain, None
+    listed = ", ".join(f"{VECTORS[name]} in {n}" for name, n in counts.items())
+    return plain, (
+        f"Measured and not read: {listed} of {len(curves)} curves; this model presses along the "
+        "inward normal and knows only the force and the markers along it"
+    )
+
+
+def tested_depth(options: Options, radius: float) -> float:
+    """Depth to which the model was tested, mm; inf without a skeleton (coupling `total`)."""
+    return level_of(options).tested * radius * (1 + 1e-9)  # with what rounding takes
+
+
+def depths(
+    displacement: Float[np.ndarray, "*n"], touch: float | np.ndarray, options: Options
+) -> Float[np.ndarray, "*n"]:
+    """How deep the tool presses, mm from first touch; before it a tool that only touches does not.
+
+    Args:
+        displacement: as recorded, mm.
+        touch: that at first touch, mm.
+        options: with `bonded` contact the tool pulls before it, a negative depth.
+    """
+    depth = displacement - touch
+    return np.maximum(depth, 0) if options.contact == "unilateral" else depth
+
+
+def untested(options: Options, radius: float, depth: float, counted: str = "") -> str:
+    """Whether a press of `depth` goes deeper than the model was tested, in words; "" if not.
+
+    `counted`: see `onset.counted_from`.
+    """
+    most = tested_depth(options, radius)
+    return f"the model was tested to D = {most:.3g} mm{counted}" if depth > most else ""
+
+
+def deeper_than_validated(
+    curves: Sequence[Curve],
+    options: Options,
+    radius: float,
+    touch: Sequence[float] | None = None,
+    counted: str = "",
+) -> str | None:
+    """A sentence on curves that go deeper than the model was tested; None: there are none.
+
+    Args:
+        curves: as recorded.
+        options: of the model.
+        radius: of the tube, mm.
+        touch: displacement of each curve at first touch, mm; None: 0.
+        counted: see `onset.counted_from`.
+    """
+    most = tested_depth(options, radius)
+    touch = [0.0] * len(curves) if touch is None else touch
+    deepest = (
+        float(np.max(np.abs(depths(c.displacement, at, options))))
+        for c, at in zip(curves, touch, strict=True)
+    )
+    deep = [d for d in deepest if d > most]
+    if not deep:
+        return None
+    cure = "cut them off or leave them out where that matters"
+    if level_of(options).tested < VALIDATED_DEPTH["softening"]:
+        cure = "choose skeleton = 'softening' or 'sections'"
+    return (
+        f"{len(deep)} of {len(curves)} curves go to {max(deep):.3g} mm{counted}; skeleton = "
+        f"{options.skeleton!r} was tested to {most:.3g} mm ({level_of(options).tested:g} of the "
+        f"radius), beyond it the model may be off by more than its bands say; {cure}"
+    )

@@ -49,9 +49,7 @@ from jaxtrachea.fitting.parameters import (
     held,
     in_model,
 )
-from jaxtrachea.fitting.refusals import Size, check_noise, refusal
-from jaxtrachea.fitting.unused_observations import as_read
-from jaxtrachea.fitting.validated_depth import depths
+from jaxtrachea.fitting.refusals import Size, as_read, check_noise, depths, refusal
 from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.levels.choose import level_of

@@ -20,8 +20,8 @@ from jaxtyping import ArrayLike
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.parameters import DECLARED
+from jaxtrachea.fitting.refusals import depths, untested
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.validated_depth import depths, untested
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Estimate, OffMidline, Predicted, Response, predicted

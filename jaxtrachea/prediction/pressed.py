@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.fitting.force_share import offsets
+from jaxtrachea.fitting.refusals import depths
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.fitting.validated_depth import depths
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.vectors import tilt_of
 

@@ -18,10 +18,10 @@ import jaxtrachea
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.refusals import deeper_than_validated, depths
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.fitting.validated_depth import deeper_than_validated, depths
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.labels import verdict_sentence

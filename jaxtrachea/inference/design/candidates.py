@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 
 from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.onset import counted_from
+from jaxtrachea.fitting.refusals import depths, untested
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.fitting.validated_depth import depths, untested
 
 #: Candidates where the user does not say: of a level that iterates, and of a formula, which costs
 #: next to nothing.
