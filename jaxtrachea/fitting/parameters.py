@@ -12,7 +12,13 @@ from jaxtrachea.mechanics.levels.choose import DECLARED as OF_LEVELS
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.line import OF_BEAM
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.sections.material import SECTION_VALUES, TOOL_RADIUS, Wall, from_wall
+from jaxtrachea.mechanics.sections.material import (
+    FROM_FACTORS,
+    SECTION_VALUES,
+    TOOL_RADIUS,
+    Wall,
+    from_wall,
+)
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS, Declaration, Fitted, Scale, Scope
 
@@ -36,6 +42,8 @@ class Parameter:
         fixed: not fitted.
         auto: fixed, but `build_study` fits it to those curves whose own record shows that it is not
             `value` (and `fixed` is then false); other curves keep `value`, which is 0.
+        foreign_value: what the factors of another tube give (`from_wall`); None: nothing. Fixed at
+            it, predictions are EXTRAPOLATED.
     """
 
     name: str
@@ -50,6 +58,7 @@ class Parameter:
     scope: Scope = "specimen"
     fixed: bool = False
     auto: bool = False
+    foreign_value: float | None = dataclasses.field(default=None, compare=False)
 
     def __post_init__(self):
         """Check that value, bounds and scale agree.
@@ -91,6 +100,11 @@ class Parameter:
                 key=self.name,
                 cure="move one or the other",
             )
+
+    @property
+    def foreign(self) -> bool:
+        """Whether it stays at what the factors of another tube give."""
+        return self.fixed and self.value == self.foreign_value
 
     def to_scaled(self, value: float) -> float:
         """Coordinate of a value: log(value) or value / step."""
@@ -184,10 +198,17 @@ def defaults_of(
         half_width=options.half_width,
     )  # fmt: skip
     values = {name: getattr(material, name) for name in SECTION_VALUES}
-    begun = {n: _begun(DEFAULTS[n], float(np.median(np.asarray(v)))) for n, v in values.items()}
+    foreign = FROM_FACTORS if material.extrapolated else ()
+    begun = {
+        n: _begun(DEFAULTS[n], float(np.median(np.asarray(v))), foreign=n in foreign)
+        for n, v in values.items()
+    }
     return DEFAULTS | begun
 
 
-def _begun(p: Parameter, value: float) -> Parameter:
+def _begun(p: Parameter, value: float, *, foreign: bool) -> Parameter:
     """A parameter with another initial value, its bounds as far from that as need be."""
-    return dataclasses.replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value))
+    return dataclasses.replace(
+        p, value=value, lower=min(p.lower, value), upper=max(p.upper, value),
+        foreign_value=value if foreign else None,
+    )  # fmt: skip

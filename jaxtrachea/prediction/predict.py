@@ -294,6 +294,11 @@ def _on_host(
         beyond = _beyond(spans, float(s), depth, aside, counted)
         deepest = float(np.max(np.abs(depth)))
         deep = untested(model.options, float(model.geometry.radius), deepest, counted)
+        foreign = [p.name for p in stored.study.parameters if p.foreign]
+        if foreign and deepest > fitted.reached(source.lane, float(s), phi, direction) + 1e-9:
+            head = message.removeprefix(status.message)
+            status = max(status, PredictionStatus.EXTRAPOLATED)
+            message = f"{status.message}{head}; fixed: {', '.join(foreign)}"
         message = "; ".join(filter(None, [message, beyond, deep]))
     return CurvePrediction(
         specimen=source.specimen,

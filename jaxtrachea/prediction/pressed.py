@@ -65,6 +65,21 @@ class Pressed:
             out[lane] = np.fmin(out[lane] * [1, -1, 1, -1], ends) * [1, -1, 1, -1]
         return out
 
+    def reached(self, lane: int, s: float, phi: float, direction: tuple[float, float]) -> float:
+        """Depth from first touch to which a lane was pressed there, mm; -inf: it was not."""
+        options, at = self.study.model.options, [s, phi, *direction]
+        rows = zip(self.curves, self.lane, self.first_touch.tolist(), strict=True)
+        return max(
+            (
+                float(np.max(np.abs(depths(c.displacement, touch, options))))
+                for c, own, touch in rows
+                if own == lane
+                and c.s_c is not None
+                and np.allclose([c.s_c, c.phi_c, *c.direction], at, rtol=0, atol=1e-6)
+            ),
+            default=-np.inf,
+        )
+
     @functools.cached_property
     def angles(self) -> np.ndarray:
         """Range of contact angle of the data of each lane, rad; (L, 2)."""

@@ -5,18 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.config import FitSpec
-from jaxtrachea.fitting.parameters import Parameter, defaults_of
+from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.sections.material import (
-    FROM_FACTORS,
-    TOOL_RADIUS,
-    Wall,
-    furthest_proportion,
-)
+from jaxtrachea.mechanics.sections.material import TOOL_RADIUS, Wall, furthest_proportion
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Share of the tube's length that measured positions leave free at an end, from which a tube that
@@ -50,22 +45,14 @@ def understood(spec: FitSpec, study: Study, result: FitResult | None = None) -> 
 
 def foreign_factors(spec: FitSpec, study: Study) -> list[str]:
     """That values are fixed at what the factors of another tube give: a line, or none."""
-    if not study.model.level.reads_wall:
+    taken = [p.name for p in study.parameters if p.foreign]
+    if not taken:
         return []
     geometry = study.model.geometry
     wall = Wall() if spec.wall is None else Wall(**spec.wall.model_dump())
     tool_radius = spec.data.tool_radius or TOOL_RADIUS
-    options = study.model.options
     why = furthest_proportion(geometry, wall, tool_radius)
-    if not why and options.half_width > 0:
-        why = "they were found with a tool that touches at a point"
-    if not why:
-        return []
-    begun = defaults_of(options, geometry, wall, tool_radius)
-    values = {p.name: p.value for p in study.parameters if p.fixed}
-    taken = [n for n in FROM_FACTORS if n in values and values[n] == begun[n].value]
-    if not taken:
-        return []
+    why = why or "they were found with a tool that touches at a point"
     whose = "[wall]" if spec.wall is not None else "the wall of the virtual specimen (no [wall])"
     return [
         f"Warning: {', '.join(taken)} stay fixed at what {whose} and the factors of another "

@@ -20,7 +20,7 @@ from jaxtrachea.surface.regions import Method
 #: What a simulation can leave out of its result.
 OUTPUTS = ("joints", "ring_ends")
 #: Effects of a line of joints, and what no other skeleton has.
-OF_JOINTS = ("friction", "rings", "axial", "end_motion", "shear", "two_material", "width")
+OF_JOINTS = ("friction", "rings", "axial", "end_motion", "shear", "two_material")
 
 
 @dataclasses.dataclass(frozen=True)

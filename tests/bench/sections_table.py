@@ -4,7 +4,7 @@
 
 prints a row a case: normal force at small strain, largest error over the peak, largest error of
 side over normal force, and the worst status. The table of docs/evidence/off_midline.md is of these
-rows. Some minutes, most of them compilation.
+rows. Two minutes, most of them compilation.
 """
 
 import os

@@ -76,7 +76,10 @@ def test_finite_strain_on_the_midline():
 
 @pytest.mark.slow
 def test_finite_strain_off_the_midline():
-    """30 and 90 degrees to 6 mm: force within 4.2 % of its peak, side force over it 0.065."""
+    """30 and 90 degrees to 6 mm: force within 4.2 % of its peak, side force over it 0.065.
+
+    Of the force itself, from 0.5 mm on, 7.5 %: a shallow press at 90 degrees is too stiff by that.
+    """
     presses = [p for p in read_measurements(VIRTUAL / "off_midline.h5").curves if p.phi_c > 0]
     s_c, phi_c = (np.array([getattr(p, k) for p in presses]) for k in ("s_c", "phi_c"))
     keys = ("displacement", "force", "side_force")
@@ -91,6 +94,7 @@ def test_finite_strain_off_the_midline():
     found, aside = np.einsum("acp,pnc->apn", axes, np.asarray(got.force)[..., 1:])
     assert np.all(np.abs(found - force).max(1) < 0.042 * force.max(1))
     deep = D[0] >= 0.5
+    assert np.all(np.abs(found / force - 1)[:, deep] < 0.075)
     assert np.all(np.abs(aside / found - side / force)[:, deep] < 0.065)
 
 
