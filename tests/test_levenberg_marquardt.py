@@ -89,7 +89,7 @@ BOXES = [
 
 
 @pytest.mark.parametrize(
-    ("count", "batch", "quick"), [(1, 16, False), (1, 16, True), (1000, 64, False)]
+    ("count", "batch", "unoptimised"), [(1, 16, False), (1, 16, True), (1000, 64, False)]
 )
 def test_minima_of_a_valley_inside_boxes(count, batch, unoptimised):
     """From `count` starts of each box, in batches with a rest: all end where the algebra says."""

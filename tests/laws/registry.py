@@ -149,15 +149,16 @@ ROWS = {
     "stretch": Row(
         _stretch,
         TUBE | {"EA": np.linspace(1, 4, 6), "s": 26.7, "force": 0.4, "k_A": 0.3, "k_B": 9.0},
-        {"force": np.nan}, (),
+        {"force": np.nan}, (), differences=1e-7,
     ),
     "duffing": Row(
         lambda v: (duffing(v["d"], _law(v)),),
         {"d": np.array([0.0, 0.3, 1.2]), "k_1": 0.3, "k_3": 0.1}, {"k_1": np.nan}, (),
+        differences=1e-7,
     ),
     "ring_weight": Row(
         lambda v: (ring_weight(v["s"], v["x"], v["t"]),), {"s": 27.2, "x": RINGS, "t": 5.0},
-        {"s": np.nan}, (),
+        {"s": np.nan}, (), differences=1e-7,
     ),
     "press_series": Row(
         _series, {"D": np.array([0.5, 3.0]), "c": 0.9, "k_1": 0.4, "k_3": 0.02}, SOFT, (),
