@@ -58,6 +58,18 @@ class PressStatus(_Described):
         "factors were found: forces up to 30 % off; fit them to presses of this tube",
     )
 
+    @property
+    def solved(self) -> bool:
+        """Whether the row holds a solution, with a warning or without; others hold NaN."""
+        return self in (
+            PressStatus.OK,
+            PressStatus.NO_CONTACT,
+            PressStatus.CONTACT_UNCERTAIN,
+            PressStatus.TOO_DEEP,
+            PressStatus.NEAR_RING_END,
+            PressStatus.EXTRAPOLATED,
+        )
+
 
 class ContactStatus(_Described):
     """What became of one distance between two convex shapes."""

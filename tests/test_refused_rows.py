@@ -149,3 +149,9 @@ def test_scenes_and_sweeps():
     assert np.isnan(swept.compliance).tolist() == [False, True, False]
     swept = swept_by(scene, Material(**FULL | {"k_1": -0.1}), *points)
     assert swept.status.tolist() == [BAD] * 3
+
+
+def test_a_status_with_a_solution_says_so():
+    """As its message does; no contact is a solution, too."""
+    for status in PressStatus:
+        assert status.solved == (status.message.startswith("solved") or status == 1), status

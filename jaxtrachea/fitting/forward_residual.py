@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.lane import Lane, forces, markers, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
+from jaxtrachea.mechanics.admission import has_solution
 from jaxtrachea.mechanics.levels.level import Motion, Response
-from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -99,8 +99,7 @@ def force_jacobian(
 
     def push(tangent):
         _, slope, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
-        solved = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
-        return jnp.where(solved, slope, jnp.nan)
+        return jnp.where(has_solution(status), slope, jnp.nan)
 
     return jax.vmap(push)(jnp.eye(free.shape[0], dtype=free.dtype))
 

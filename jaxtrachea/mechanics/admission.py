@@ -6,12 +6,14 @@ derivatives of other rows stay finite.
 """
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_fits, check_word, shaped
 from jaxtrachea._errors import InputError
@@ -157,6 +159,11 @@ def _replaced(
             safe[name] = jnp.where(bad, 1, value)
             found = found | jnp.any(bad)
     return dataclasses.replace(material, **safe), found
+
+
+def has_solution(status: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+    """Where a row holds a solution, with a warning or without (`PressStatus.solved`)."""
+    return functools.reduce(operator.or_, (status == s for s in PressStatus if s.solved))
 
 
 def hide(refused: Int[Array, ""], *arrays: Any) -> Any:

@@ -12,12 +12,12 @@ from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.fusion import map_sequentially
+from jaxtrachea.mechanics.admission import has_solution
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
 from jaxtrachea.scene.curve import distance_from, lay
 from jaxtrachea.scene.stage import Poses, Presses, Scene
-from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
 
@@ -115,7 +115,7 @@ def deform_sections(scene: Scene, presses: Presses, moved: Any, path: Any, made:
         dent = _dent(scene, s_c, phi_c, radius, tool, way - u[-1])
         return place(mesh, local.add_correction(u[:-1], dent, straight, runs, s_c))
 
-    solved = (moved.status == PressStatus.OK) | (moved.status == PressStatus.NO_CONTACT)
+    solved = has_solution(moved.status)
 
     def rows(v, otherwise):
         return jnp.where(solved.reshape(-1, *[1] * (v.ndim - 1)), v, otherwise)

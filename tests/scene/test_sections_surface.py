@@ -87,6 +87,10 @@ def test_vertices_go_with_tool_and_rings(dtype):
     assert 0.5 < u[4, vertex(75, 0.0), 1] < 2.0
     lids = np.asarray(MESH.s) % 160 == 0
     assert np.abs(u[[0, 1, 4]][:, lids]).max() < exact
+    # A solution with a warning has its surface, too.
+    unlike = run(scene, dataclasses.replace(wall, extrapolated=wall.extrapolated + 1), path)
+    assert unlike.status[0] == PressStatus.EXTRAPOLATED
+    np.testing.assert_array_equal(unlike.vertices, out.vertices)
 
 
 @pytest.mark.slow
