@@ -125,16 +125,15 @@ def test_the_whole_update_of_one_pose():
         [v for v in text.split("\n") if " call(" in v and 'inlineable="false"' in v]
         for text in (value, gradient)
     )
-    # The contact, the rotation of first touch, the skeleton, shares and lines of the surface, what
-    # goes into the dent and where it reaches; in order: across the surface, and the dent's Cholesky
-    # factors. All but where the dent reaches have derivatives.
-    assert len(called) == 9
-    assert len(back) == 9 + 8
+    # The contact, the skeleton, and where the dent reaches, which has no derivatives.
+    assert len(called) == 3
+    assert len(back) == 3 + 2
     if version("jaxlib") in SUPPORTED_JAXLIB:
-        assert sum(ONE in v for v in called) == 7
-        # Of the same programs without one kernel for a part: 1,163, and with the gradient 1,834.
-        assert count_kernels(value, inside=False)[0] <= MARGIN * 45
-        assert count_kernels(gradient, inside=False)[0] <= MARGIN * 182
+        assert sum(ONE in v for v in called) == 3
+        # Without one kernel for a part 1,163, and with the gradient 1,834; with one for each of
+        # the parts that gained less than 1.3 by it (docs/evidence/measured.md) 45 and 182.
+        assert count_kernels(value, inside=False)[0] <= MARGIN * 83
+        assert count_kernels(gradient, inside=False)[0] <= MARGIN * 433
 
 
 STEP = """
@@ -155,7 +154,7 @@ print(json.dumps(Session(full.scene, full.material)._program._run.as_text()))
 
 @pytest.mark.slow
 def test_a_step_of_a_session_is_one_kernel_but_for_the_surface():
-    """Contact, seat, skeleton, force and what is packed: with the surface 1,042 kernels before."""
+    """Contact, anchor, skeleton, force and what is packed: 1,042 kernels with the surface before."""
     environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     run = subprocess.run(
         [sys.executable, "-c", STEP], capture_output=True, text=True, env=environment
@@ -163,7 +162,7 @@ def test_a_step_of_a_session_is_one_kernel_but_for_the_surface():
     assert run.returncode == 0, run.stderr
     text = json.loads(run.stdout)
     if version("jaxlib") in SUPPORTED_JAXLIB:
-        assert count_kernels(text, inside=False)[0] <= MARGIN * 28
+        assert count_kernels(text, inside=False)[0] <= MARGIN * 43
 
 
 def largest_array(text: str) -> int:
