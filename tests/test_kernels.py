@@ -154,7 +154,7 @@ print(json.dumps(Session(full.scene, full.material)._program._run.as_text()))
 
 @pytest.mark.slow
 def test_a_step_of_a_session_is_one_kernel_but_for_the_surface():
-    """Contact, anchor, skeleton, force and what is packed: 1,042 kernels with the surface before."""
+    """Contact, anchor, skeleton, force, what is packed: 1,042 kernels with the surface before."""
     environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     run = subprocess.run(
         [sys.executable, "-c", STEP], capture_output=True, text=True, env=environment
