@@ -70,10 +70,9 @@ def map_sequentially(part: Callable[..., Out]) -> Callable[..., Out]:
 
     For parts that are a large array and go through it several times: those of many lanes are out of
     the cache before they are read again. A lane, on a CPU, is then as if there were no other:
-    `fuse` inside is what it says. Small arrays (`_linear.LARGE`) and other
-    devices take all lanes together. Values and derivatives are the same but for rounding;
-    derivatives begin with the part once more, and are taken in turn too; twice backwards through a
-    loop only from JAX 0.11 on.
+    `fuse` inside is what it says. Small arrays (`_linear.LARGE`) and other devices take all lanes
+    together. Values and derivatives are the same but for rounding; derivatives begin with the part
+    once more, and are taken in turn too; twice backwards through a loop only from JAX 0.11 on.
 
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.

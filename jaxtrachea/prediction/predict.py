@@ -283,7 +283,7 @@ def _on_host(
 
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
-    status, message = _verdict(source, value, se, presses, bend)
+    beyond, deep, foreign = "", "", []
     if usable:
         fitted = pressed(stored)
         spans, angles = fitted.spans[source.lane], fitted.angles[source.lane]
@@ -295,11 +295,10 @@ def _on_host(
         deepest = float(np.max(np.abs(depth)))
         deep = untested(model.options, float(model.geometry.radius), deepest, counted)
         foreign = [p.name for p in stored.study.parameters if p.foreign]
-        if foreign and deepest > fitted.reached(source.lane, float(s), phi, direction) + 1e-9:
-            head = message.removeprefix(status.message)
-            status = max(status, PredictionStatus.EXTRAPOLATED)
-            message = f"{status.message}{head}; fixed: {', '.join(foreign)}"
-        message = "; ".join(filter(None, [message, beyond, deep]))
+        if foreign and deepest <= fitted.reached(source.lane, float(s), phi, direction) + 1e-9:
+            foreign = []  # the fit has seen such a press
+    status, message = _verdict(source, value, se, presses, bend, foreign)
+    message = "; ".join(filter(None, [message, beyond, deep]))
     return CurvePrediction(
         specimen=source.specimen,
         trial=source.trial,
@@ -381,8 +380,14 @@ def _beyond(spans: np.ndarray, s: float, depth: np.ndarray, aside=(), counted: s
     return f"extrapolated from data at {' and '.join(words)}" if words else ""
 
 
-def _verdict(source: CurveParameters, value: Response, se: Response, presses, bend: float):
-    """The worst that is to be said of a predicted curve, and everything in words."""
+def _verdict(
+    source: CurveParameters, value: Response, se: Response, presses, bend: float,
+    foreign: Sequence[str] = (),
+):  # fmt: skip
+    """The worst that is to be said of a predicted curve, and everything in words.
+
+    `foreign`: parameters at another tube's values, where the fit has seen no such press.
+    """
     found = [(source.status, source.message)]
     if source.status.predicts:
         lost = ~np.isfinite(value.force)
@@ -394,6 +399,8 @@ def _verdict(source: CurveParameters, value: Response, se: Response, presses, be
             found.append((PredictionStatus.TOO_DEEP, word))
         if np.isinf(se.force).any() or np.isinf(source.half_width):
             found.append((PredictionStatus.UNDETERMINED, ""))
+        if foreign:
+            found.append((PredictionStatus.EXTRAPOLATED, f"fixed: {', '.join(foreign)}"))
         if bend > BENT:
             word = f"off by {bend:.2g} half-widths at the deepest"
             if np.isinf(bend):

@@ -43,13 +43,13 @@ from jaxtrachea.scene.refusals import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 
-#: Way along the surface that a anchor holds, over the depth.
+#: Way along the surface that an anchor holds, over the depth.
 MAX_SLIDE = 1.0
 #: Largest difference of the anchor's press and the tool's depth, over the depth.
 MAX_MISMATCH = 0.5
 #: Least normal force, over that of a press straight in.
 LEAST_FORCE_SHARE = 0.1
-#: Share of half a ring spacing that a anchor holds at most: beyond it one place does not serve.
+#: Share of half a ring spacing that an anchor holds at most: beyond it one place does not serve.
 SPACING_SHARE = 0.99
 #: Length of the press over the depth, at most: with it the local law is at its stiffest.
 STRETCHED = 3.0
@@ -248,7 +248,7 @@ def re_anchor(scene: Scene, anchor: Anchor, way: Float[Array, "3"], path: Poses)
 
 
 def _largest_slide(scene: Scene, depth):
-    """Way along the surface that a anchor holds at this depth, mm."""
+    """Way along the surface that an anchor holds at this depth, mm."""
     return jnp.minimum(MAX_SLIDE * depth, SPACING_SHARE * half_spacing(scene))
 
 

@@ -19,7 +19,7 @@ import time
 #: By site: module, mark, kinds of rows it reaches.
 SCENE = ("step", "session")
 SITES = {
-    "none": ("", "", (*SCENE, "sections", "fit", "bound")),
+    "none": ("", "", ()),
     "all": ("", "", (*SCENE, "bound")),
     "inner": ("", "", SCENE),
     "skeleton": ("scene.simulation", "fuse", SCENE),
@@ -123,29 +123,7 @@ def rows(kind: str) -> dict:
             return out
 
         return {"bound press": twenty}
-    import functools
-
-    import fitting
-    import gradient
-
-    from jaxtrachea.fitting import cost, residual
-    from jaxtrachea.fitting.noise import first_sigma
-    from jaxtrachea.fitting.settings import Settings
-    from jaxtrachea.fitting.starts import draw_starts
-
-    study, *_ = fitting.make_study(gradient.FITS)
-    lanes = jax.device_put(study.lanes)
-    theta = jnp.asarray(draw_starts(study, Settings(starts=1)))
-    sigma = jnp.asarray(first_sigma(study))
-
-    def of(f):
-        return jax.vmap(functools.partial(f, study.model))
-
-    return {
-        "512 residuals": gradient.wait(of(residual.residual_value), theta, lanes),
-        "512 residuals, Jacobian": gradient.wait(of(residual.residual), theta, lanes),
-        "512 costs": gradient.wait(of(cost.evaluate), theta, lanes, sigma),
-    }
+    raise ValueError(kind)
 
 
 def work(site: str, kind: str) -> None:
