@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
@@ -56,7 +57,7 @@ def study():
 
 def scipy_minimum(study, lane, start):
     """SciPy's minimum of one lane on all samples, and half the sum of squares there."""
-    model, data = study.model, jax.tree.map(lambda v: v[lane], study.lanes)
+    model, data = study.model, jax.tree.map(lambda v: jnp.asarray(v[lane]), study.lanes)
     value = jax.jit(lambda theta: residual_value(model, theta, data) * data.balance[:, None])
     found = least_squares(
         lambda theta: np.asarray(value(theta)).ravel(), start, xtol=1e-15, ftol=1e-15, gtol=1e-15
