@@ -144,6 +144,12 @@ class Half(Level):
     def admits(self, curve, size, onset=0.0):
         return self.within.admits(curve, size, onset)
 
+    def check(self, tube, material):
+        self.within.check(tube, material)
+
+    def without_negative(self, material, also):
+        return self.within.without_negative(material, also)
+
     def material(self, values):
         return self.within.material(values)
 

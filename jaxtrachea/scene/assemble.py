@@ -10,9 +10,9 @@ import numpy as np
 from jaxtrachea._arguments import check_fits, check_word
 from jaxtrachea.contact.search import STANDARD
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.sections.wall import Points, gather_points
-from jaxtrachea.scene.declare import AnyMaterial, PlanError, SceneFacts
+from jaxtrachea.scene.declare import PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
@@ -78,9 +78,10 @@ def make_scene(
     dtype = geometry.length.dtype
     shape = jax.tree.map(lambda v: jnp.asarray(v, dtype), tool.shape)
     friction = tool.friction
-    sections = isinstance(material, SectionMaterial)
-    if radius is None and isinstance(material, SectionMaterial):
-        outer = geometry.radius + material.offset
+    kind = level_type(material)
+    own, sections = kind.thickness(material), not kind.hangs_on_rings
+    if radius is None and own is not None:
+        outer = geometry.radius + own / 2
     else:
         outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
     check_sizes(geometry, float(outer), shape)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
+from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.sections.material import (
     FROM_FACTORS,
     SECTION_VALUES,
@@ -20,7 +21,7 @@ from jaxtrachea.mechanics.sections.material import (
 )
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import make_scene
-from jaxtrachea.scene.declare import AnyMaterial, PlanError
+from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.paths import named_file, path_of, read_table
@@ -88,8 +89,8 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
         radius = float(geometry.radius)  # that of the outer wall
-    if isinstance(material, SectionMaterial):
-        radius = float(geometry.radius) + float(material.offset)
+    if (own := level_type(material).thickness(material)) is not None:
+        radius = float(geometry.radius) + float(own) / 2
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, mesh=mesh, radius=radius,
@@ -104,7 +105,7 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         raise _of_file(error) from None
     except SizeError as error:
         raise SpecError.like(error.renamed(KEYS)) from None
-    if scene.tube is not None and isinstance(material, Material):
+    if scene.tube is not None and scene.plan.mechanics.hangs_on_rings:
         lost, filled = float(scene.tube.lost.max()), float(scene.tube.filled.max())
         notes += (
             f"contact patches: the surface stands out of them by up to {lost:.2g} mm; hollows (and "
@@ -227,8 +228,8 @@ def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path], coun
 def _tube(section: SceneTracheaSection, geometry: Geometry, material: AnyMaterial) -> Mesh:
     """The generated surface; of deforming cross-sections round, at the outside of their wall."""
     key, size = "trachea", {"wall": section.wall, "relief": section.relief}
-    if isinstance(material, SectionMaterial):
-        size = {"wall": 2 * float(material.offset), "relief": 0.0, "flatten": 0.0}
+    if (own := level_type(material).thickness(material)) is not None:
+        size = {"wall": float(own), "relief": 0.0, "flatten": 0.0}
         key = f"trachea: a wall of deforming cross-sections of {size['wall']:g} mm (twice offset)"
     try:
         return make_tube(geometry, around=section.around, along=section.along, lids=True, **size)

@@ -7,12 +7,8 @@ from typing import Any, Literal, NamedTuple
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea._errors import InputError
-from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.trachea.material import Material
 
-#: What a scene can be of: a line of joints, or deforming cross-sections.
-AnyMaterial = Material | SectionMaterial
-#: What stands for the latter among the values that a material gives.
+#: What stands for deforming cross-sections among the values that a material gives.
 SECTIONS = "sections"
 
 

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from typing import Any, Literal, get_args, get_type_hints
 
 from jaxtrachea._arguments import check_record
+from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene import depth, width
-from jaxtrachea.scene.declare import SECTIONS, AnyMaterial, Case, Effect, PlanError, Verdict
+from jaxtrachea.scene.declare import SECTIONS, Case, Effect, PlanError, Verdict
 from jaxtrachea.surface.regions import Method
 from jaxtrachea.trachea.material import DEEP
 
@@ -283,7 +283,7 @@ EFFECTS = _declared()
 
 def given_values(material: AnyMaterial) -> frozenset[str]:
     """Optional values that effects read and the material gives; `SECTIONS` of one of sections."""
-    if isinstance(material, SectionMaterial):
+    if not level_type(material).hangs_on_rings:
         return frozenset({SECTIONS})
     names = {name for effect in EFFECTS.values() for name in effect.material}
     return frozenset(name for name in names if getattr(material, name) is not None)

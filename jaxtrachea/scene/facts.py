@@ -6,9 +6,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.scene.approach import first_touch
-from jaxtrachea.scene.declare import AnyMaterial, SceneFacts
+from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.effects import EffectOptions, given_values
 from jaxtrachea.scene.landing import landing
 from jaxtrachea.scene.lumen import in_lumen
@@ -66,8 +66,7 @@ def facts_of(
     motion = motion_of(s[held], here[held], moved[held], np)
     whole = max(_largest(motion.length), 1e-9)
 
-    sections = isinstance(material, SectionMaterial)
-    radius = float(scene.geometry.radius if sections else scene.radius)
+    radius = float(level_type(material).wall_radius(scene.geometry, scene.radius))
 
     def reach(way, drawn):
         least, most = np.fmin.reduce(way[drawn], initial=0), np.fmax.reduce(way[outside], initial=0)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._numerics import scaled
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
 from jaxtrachea.mechanics.press import (
@@ -121,6 +122,14 @@ def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
         return press_oblique(*fixed, s, phi, D, plan.oblique)
 
     return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement), plan)
+
+
+def move(scene: Scene, material: Any, presses: Presses) -> Moved:
+    """Force and skeleton by the program of the scene's plan."""
+    if not scene.plan.mechanics.hangs_on_rings:
+        return cross_sections(scene, material, presses)
+    solve = vectors if scene.plan.second_plane else one_plane
+    return fuse(lambda presses: solve(scene, material, presses))(presses)
 
 
 def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) -> Moved:

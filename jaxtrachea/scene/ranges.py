@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxtrachea.contact.patches import Touch
-from jaxtrachea.scene.declare import AnyMaterial
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.scene.depth import SHALLOW, departure
 from jaxtrachea.scene.effects import EFFECTS, given_values
 from jaxtrachea.scene.needs import (

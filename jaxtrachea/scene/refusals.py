@@ -7,15 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea.mechanics.admission import without_negative
-from jaxtrachea.mechanics.press import read_values
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.ring import on_ring
-from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.sections.press import safe_values
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.mechanics.skeleton import read_values as skeleton_values
 from jaxtrachea.scene.approach import Approach
-from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.lumen import off_the_end
 from jaxtrachea.scene.ranges import DEEPEST, outside_plan
 from jaxtrachea.scene.stage import Presses, Scene
@@ -29,16 +25,12 @@ REFUSALS = (PressStatus.OFF_TUBE, PressStatus.OFF_PLAN, PressStatus.BEHIND_GAP,
 def without_negative_values(scene: Scene, material: AnyMaterial):
     """The material with 1 in place of negative values that the plan reads, and whether it had any.
 
-    A negative coefficient of friction counts as well (`press_path` puts 0 in its place). Presses of
-    deforming cross-sections see to their own values.
+    A negative coefficient of friction counts as well (`press_path` puts 0 in its place).
     """
     plan = scene.plan
-    if isinstance(material, SectionMaterial):
-        return material, safe_values(material)[1]
-    shear = plan.options.shear
-    skeleton = skeleton_values(plan.rings, axial=plan.axial, shear=shear)
-    used = (*read_values(plan.options), *(skeleton if plan.second_plane else ()))
-    material, bad = without_negative(material, dict.fromkeys(used))
+    skeleton = skeleton_values(plan.rings, axial=plan.axial, shear=plan.options.shear)
+    also = skeleton if plan.second_plane else ()
+    material, bad = plan.mechanics.without_negative(material, also)
     if plan.friction and scene.friction is not None:
         bad = bad | (scene.friction < 0)
     return material, bad

@@ -19,7 +19,7 @@ from jaxtrachea._packed import Packing
 from jaxtrachea.contact.pose import check_rotations, is_rotation
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_alike
-from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.scene.anchor import (
     Anchor,
     Instant,
@@ -35,12 +35,11 @@ from jaxtrachea.scene.anchor import (
 )
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.assemble import with_tool
-from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.held_force import HeldForce, held_force, next_force, no_force
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.simulation import Simulation, pressed
-from jaxtrachea.scene.stage import Poses, Scene, check_material, touch_tube
+from jaxtrachea.scene.stage import Poses, Scene, check_kind, check_material, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -108,7 +107,7 @@ def check_scene(scene: Scene, material: AnyMaterial) -> None:
     """
     if not scene.plan.contact or scene.tool is None:
         raise ValueError("the plan has no contact; make the scene with a path of Poses")
-    if isinstance(material, SectionMaterial) or not scene.plan.mechanics.stepwise:
+    if not scene.plan.mechanics.stepwise:
         raise ValueError(
             "a session has no skeleton 'sections'; use simulate, or make the scene with the "
             "Material of a line of joints"
@@ -118,6 +117,7 @@ def check_scene(scene: Scene, material: AnyMaterial) -> None:
             "the plan has friction, which depends on the whole path; use simulate, or make the "
             "scene with EffectOptions(friction='off')"
         )
+    check_kind(scene, material)
     check_material(scene.geometry, material)
 
 
@@ -159,7 +159,6 @@ class Session:
             raise ValueError(f"keep is {keep}; expected at least 1")
         check_scene(scene, material)
         assert scene.tool is not None
-        assert not isinstance(material, SectionMaterial)
         self.scene, self.material = scene, material
         self.dtype = np.dtype(scene.footprint.dtype)
         given = Changeable(material, scene.tool, scene.footprint)

@@ -12,19 +12,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import full_precision
-from jaxtrachea.fusion import fuse
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.oblique import Place, press_at
-from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.configurational import force_by_pose
-from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.deform import deform, deform_sections
-from jaxtrachea.scene.programs import cross_sections, moved_by, one_plane, vectors
+from jaxtrachea.scene.programs import move, moved_by
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import hidden_rows, hide, refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
 from jaxtrachea.status import PressStatus
-from jaxtrachea.trachea.material import Material
 
 
 class Simulation(NamedTuple):
@@ -160,15 +157,12 @@ def pressed(
     material, bad = without_negative_values(scene, material)
     given = path if isinstance(path, Presses) else None
     presses, used, inward, refused = refuse(scene, material, given, made, bad)
-    if isinstance(material, SectionMaterial):
-        moved = cross_sections(scene, material, used)
-    elif place is not None:
-        moved = moved_by(press_at(place, used.displacement, plan.options), plan)
+    if place is None:
+        moved = move(scene, material, used)
     else:
-        solve = vectors if plan.second_plane else one_plane
-        moved = fuse(lambda used: solve(scene, material, used))(used)
+        moved = moved_by(press_at(place, used.displacement, plan.options), plan)
     force, moment, solved = moved.force, None, moved.status
-    of_joints = isinstance(material, Material)
+    of_joints = plan.mechanics.hangs_on_rings
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:
         force, moment = force_by_pose(scene, material, path, used, moved, made)
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))

@@ -12,20 +12,17 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_word, real, shaped
-from jaxtrachea._errors import InputError
 from jaxtrachea.contact.patches import Patches, Touch, touch
 from jaxtrachea.contact.pose import Pose, check_rotations
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.fusion import fuse
-from jaxtrachea.mechanics.admission import check_shapes
-from jaxtrachea.mechanics.sections.material import SectionMaterial, check_sections
+from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.sections.wall import Points
-from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import DEEP, Material
+from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import Mesh
 
 
@@ -86,17 +83,7 @@ def check_material(geometry: Geometry, material: AnyMaterial) -> None:
     Raises:
         ValueError: naming the value, what was expected and the cure.
     """
-    if isinstance(material, SectionMaterial):
-        check_sections(geometry, material)
-        return
-    check_shapes(geometry, material)
-    given = {name: getattr(material, name) is not None for name in DEEP}
-    if any(given.values()) and not all(given.values()):
-        one, other = sorted(DEEP, key=given.__getitem__, reverse=True)
-        raise InputError(
-            f"given without Material.{other}, and would be ignored", key=f"Material.{one}",
-            cure=f"give Material.{other} too (0 where the law has no such part), or leave it out",
-        )  # fmt: skip
+    level_type(material).check(geometry, material)
 
 
 def check_kind(scene: "Scene", material: AnyMaterial) -> None:

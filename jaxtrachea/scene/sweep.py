@@ -10,13 +10,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import full_precision
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.oblique import press_oblique
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.needs import off_midline
 from jaxtrachea.scene.ranges import deep, depth_share, lacking
 from jaxtrachea.scene.refusals import REFUSALS, on_the_tube, status_of

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea._packed import Packing
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.scene.approach import approach
-from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.session import Session, check_scene
 from jaxtrachea.scene.simulation import pressed, simulate

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtrachea._arguments import check_record
 from jaxtrachea.contact.search import FINE
 from jaxtrachea.mechanics.press import default_transition
-from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.assemble import with_geometry, with_mesh
 from jaxtrachea.scene.build import Staged, effects_of
 from jaxtrachea.scene.declare import PlanError, SceneFacts
@@ -126,7 +125,7 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
         PlanError: a wish that cannot be met.
     """
     scene, material, path = staged.scene, staged.material, staged.path
-    if isinstance(material, SectionMaterial):
+    if not scene.plan.mechanics.hangs_on_rings:
         why = "nothing of deforming cross-sections is traded for time"
         raise PlanError("skeleton", "'sections'", why, "leave [plan] out, or give [material]")
     given = effects_of(spec)

@@ -1,17 +1,21 @@
-"""The one door: the level that options ask for."""
+"""The two doors: the level that options ask for, and its kind where a material alone is there."""
 
 import functools
 import operator
 from collections.abc import Mapping
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.mechanics.levels.level import Level
 from jaxtrachea.mechanics.levels.line import Line
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.levels.sections import Sections
-from jaxtrachea.trachea.material import Declaration
+from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.trachea.material import Declaration, Material
 
 #: The level of each word of `Options.skeleton`.
 LEVELS = {"linear": Line, "softening": Line, "sections": Sections}
+#: What a scene can be of, before its options are chosen.
+AnyMaterial = Material | SectionMaterial
 #: The parameters of all levels, by name.
 DECLARED: Mapping[str, Declaration] = functools.reduce(
     operator.or_, (kind.declares for kind in LEVELS.values())
@@ -22,3 +26,13 @@ DECLARED: Mapping[str, Declaration] = functools.reduce(
 def level_of(options: Options) -> Level:
     """The level that options ask for; equal where they are."""
     return LEVELS[options.skeleton](options)
+
+
+def level_type(material: AnyMaterial) -> type[Level]:
+    """The kind of level whose values a material has.
+
+    Raises:
+        ValueError: no level has such a material.
+    """
+    check_word("material", material, AnyMaterial)
+    return next(kind for kind in LEVELS.values() if isinstance(material, kind.material_type))

@@ -5,11 +5,11 @@ parameters, tube and motion are arguments.
 """
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.force_law import Law
@@ -188,9 +188,33 @@ class Level(abc.ABC):
         """Depth beyond which it has no meaning, mm."""
         return np.inf
 
-    def wall_radius(self, tube: Geometry, outer: Any) -> Any:
+    @classmethod
+    def wall_radius(cls, tube: Geometry, outer: Any) -> Any:
         """Radius that the depth of a press is measured by, mm; `outer`: of the tube's outside."""
         return outer
+
+    @classmethod
+    def thickness(cls, material: Any) -> Any:
+        """Of the wall that the material itself has, mm; None: it has none."""
+        return None
+
+    @classmethod
+    @abc.abstractmethod
+    def check(cls, tube: Geometry, material: Any) -> None:
+        """Refuse arrays of a wrong length, and values that mean nothing without another.
+
+        Raises:
+            ValueError: naming the value, what was expected and the cure.
+        """
+
+    @abc.abstractmethod
+    def without_negative(self, material: Any, also: Iterable[str]) -> tuple[Any, Bool[Array, ""]]:
+        """Values that it can compute with, and whether a negative one was read.
+
+        Args:
+            material: as given.
+            also: names that are read beside those that the options read.
+        """
 
     @abc.abstractmethod
     def needs(self, *, joints: bool) -> frozenset[str]:

@@ -1,22 +1,23 @@
 """The beam levels: a line of joints on the rings, with softening, width and shear as its parts."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics import press as _press
+from jaxtrachea.mechanics.admission import check_shapes, without_negative
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import OF_PRESS, VALUES, Material, material_of
+from jaxtrachea.trachea.material import DEEP, OF_PRESS, VALUES, Material, material_of
 
 #: Depth to which a skeleton was compared with finite elements, in radii of the tube
 #: (docs/evidence/virtual_trachea.md). At a tenth that specimen yields 13 % more than a linear
@@ -123,6 +124,26 @@ class Line(Level):
             onset=motion.onset, blend=motion.blend,
         )  # fmt: skip
         return Response(found.force, found.joints, found.status, reactions=found.reactions)
+
+    @classmethod
+    def check(cls, tube: Geometry, material: Material) -> None:
+        """See `Level`; half of what a skeleton softens by is refused, too."""
+        check_shapes(tube, material)
+        given = {name: getattr(material, name) is not None for name in DEEP}
+        if any(given.values()) and not all(given.values()):
+            one, other = sorted(DEEP, key=given.__getitem__, reverse=True)
+            raise InputError(
+                f"given without Material.{other}, and would be ignored", key=f"Material.{one}",
+                cure=f"give Material.{other} too (0 where the law has no such part), or leave it "
+                "out",
+            )  # fmt: skip
+
+    def without_negative(
+        self, material: Material, also: Iterable[str]
+    ) -> tuple[Material, Bool[Array, ""]]:
+        """1 in the place of negative values; others that the options do not read stay."""
+        read = _press.read_values(self.options)
+        return without_negative(material, dict.fromkeys((*read, *also)))
 
     def skeleton(
         self, tube: Geometry, material: Material, s_c: Float[Array, "*m"], *, joints: bool

@@ -1,19 +1,24 @@
 """The level of deforming cross-sections: anywhere on the rings, at finite strain, tool stuck."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._errors import InputError
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial
-from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections, tested_angle
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial, check_sections
+from jaxtrachea.mechanics.sections.press import (
+    SectionOptions,
+    press_sections,
+    safe_values,
+    tested_angle,
+)
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS
@@ -60,9 +65,26 @@ class Sections(Level):
         """The tube has no more room than its radius."""
         return radius
 
-    def wall_radius(self, tube: Geometry, outer: Any) -> Any:
+    @classmethod
+    def wall_radius(cls, tube: Geometry, outer: Any) -> Any:
         """That of the wall's mid-line."""
         return tube.radius
+
+    @classmethod
+    def thickness(cls, material: SectionMaterial) -> Any:
+        """Twice the distance of its outside from its mid-line."""
+        return 2 * material.offset
+
+    @classmethod
+    def check(cls, tube: Geometry, material: SectionMaterial) -> None:
+        """See `check_sections`."""
+        check_sections(tube, material)
+
+    def without_negative(
+        self, material: SectionMaterial, also: Iterable[str]
+    ) -> tuple[SectionMaterial, Bool[Array, ""]]:
+        """The material as it is: a press sees to its own values."""
+        return material, safe_values(material)[1]
 
     def needs(self, *, joints: bool) -> frozenset[str]:
         """Whatever there is to see."""
