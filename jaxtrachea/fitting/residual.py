@@ -17,8 +17,9 @@ from jaxtrachea.fitting.lane import Lane, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import SKELETON
 from jaxtrachea.mechanics.equilibrium import sensitivity
-from jaxtrachea.mechanics.force_law import Law, coefficient
+from jaxtrachea.mechanics.force_law import coefficient
 from jaxtrachea.mechanics.levels.level import Closed, Motion
+from jaxtrachea.mechanics.press import Contact
 from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -51,20 +52,16 @@ class Inputs(NamedTuple):
     Attributes:
         compliance: of the skeleton as the force feels it, mm/N; (T,).
         joints: motion of every ring under a unit force, mm/N; (T, rings); None without markers.
-        law: at the contact; (T,).
-        onset: mm; (T,).
+        contact: law, onset and softening; (T,).
         force_offset: N; (T,).
-        softening: of the skeleton; (T,). None where it is linear.
         force_slope: of the force without contact, N/mm; (T,). None where the model has no such
             line.
     """
 
     compliance: Float[Array, " T"]
     joints: Float[Array, "T rings"] | None
-    law: Law
-    onset: Float[Array, " T"]
+    contact: Contact
     force_offset: Float[Array, " T"]
-    softening: Softening | None
     force_slope: Float[Array, " T"] | None = None
 
 
@@ -90,9 +87,8 @@ def inputs(
     def at(free, value, s_c):
         return _at_contact(model, free, value, s_c, tube)
 
-    contact = jax.vmap(at)(free, lane.value, lane.s_c)
-    felt = _felt(model, skeleton)
-    return Inputs(compliance=felt, joints=skeleton.joints, **contact._asdict())
+    local = jax.vmap(at)(free, lane.value, lane.s_c)
+    return Inputs(_felt(model, skeleton), skeleton.joints, *local)
 
 
 def residual(
@@ -127,9 +123,9 @@ def residual_value(
     skeleton = _skeleton(model, free, _places(lane), tube)
 
     def one(free, skeleton, trial):
-        at = _at_contact(model, free, trial.value, trial.s_c, tube)
-        motion = Motion(trial.s_c, trial.displacement, at.onset, trial.blend)
-        solved = _closed(model).respond(motion, _felt(model, skeleton), at.law, at.softening)
+        at = _at_contact(model, free, trial.value, trial.s_c, tube, trial.blend)
+        felt = _felt(model, skeleton)
+        solved = _closed(model).respond(trial.displacement, felt, at.contact)
         load = solved.force if solved.load is None else solved.load
         joints = None if skeleton.joints is None else _times(load, skeleton.joints)
         without = at.force_offset
@@ -220,21 +216,19 @@ def _skeleton_and_derivative(
     return jax.vmap(push, out_axes=(None, 1))(along)
 
 
-class _Contact(NamedTuple):
+class _Local(NamedTuple):
     """What one trial's force depends on besides the skeleton; scalars."""
 
-    law: Law
-    onset: Float[Array, ""]
+    contact: Contact
     force_offset: Float[Array, ""]
-    softening: Softening | None
     force_slope: Float[Array, ""] | None
 
 
-def _at_contact(model: FitModel, free, value, s_c, tube: Geometry) -> _Contact:
+def _at_contact(model: FitModel, free, value, s_c, tube: Geometry, blend=None) -> _Local:
     values = values_of(model, free, value)
-    law, softening = _closed(model).local(tube, model.level.material(values), s_c)
-    zeros = values["onset"], values["force_offset"]
-    return _Contact(law, *zeros, softening, values.get("force_slope"))
+    material = model.level.material(values)
+    contact = _closed(model).contact(tube, material, s_c, values["onset"], blend)
+    return _Local(contact, values["force_offset"], values.get("force_slope"))
 
 
 def _felt(model: FitModel, skeleton: Skeleton):
@@ -297,7 +291,8 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
     def push(t):
         return jax.jvp(at_contact, (free,), (t,))
 
-    contact, d_contact = jax.vmap(push, out_axes=(None, 0))(eye)
+    local, d_local = jax.vmap(push, out_axes=(None, 0))(eye)
+    contact, d_contact = local.contact._replace(blend=blend), d_local.contact
     of_beam = _beam_columns(model)
 
     def all_columns(v):
@@ -306,10 +301,9 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
         return jnp.stack(columns) if columns else v[:0]
 
     d_skeleton = jax.tree.map(all_columns, by_beam)
-    law, c = contact.law, _felt(model, skeleton)
-    moved = motion._replace(onset=contact.onset)
-    solved = _closed(model).respond(moved, c, law, contact.softening)
-    of_force, of_load = sensitivity(solved, c, law, contact.softening)
+    c = _felt(model, skeleton)
+    solved = _closed(model).respond(D, c, contact)
+    of_force, of_load = sensitivity(solved, c, contact.law, contact.softening)
 
     def at(onset):
         return _closed(model).touch(D, onset, blend)
@@ -337,10 +331,10 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
     if blend is not None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
         corner = of_force["displacement"] * curved * jnp.sum(d_contact.onset**2)
-    offset, d_offset = contact.force_offset, d_contact.force_offset[:, None]
-    if contact.force_slope is not None:
-        offset = offset + contact.force_slope * D
-        d_offset = d_offset + d_contact.force_slope[:, None] * D[None]
+    offset, d_offset = local.force_offset, d_local.force_offset[:, None]
+    if local.force_slope is not None:
+        offset = offset + local.force_slope * D
+        d_offset = d_offset + d_local.force_slope[:, None] * D[None]
     return _Pressed(
         force=solved.force,
         d_force=d_force,

@@ -28,7 +28,8 @@ from jaxtrachea.fitting.residual import Inputs, inputs, of_trials, residual
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
-from jaxtrachea.mechanics.levels.level import Closed, Motion
+from jaxtrachea.mechanics.levels.level import Closed
+from jaxtrachea.mechanics.press import Contact
 from jaxtrachea.mechanics.softening import Softening
 
 #: Points of the parameter box, and half its width in decades.
@@ -283,7 +284,7 @@ def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
         k_1, *more = _nonlinear(x)
         rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(k_1), *more]
         rows += [] if x.force_slope is None else [x.force_slope]
-        rows = jnp.stack([*rows, x.onset, x.force_offset], axis=1)
+        rows = jnp.stack([*rows, x.contact.onset, x.force_offset], axis=1)
         if x.joints is None:
             return rows
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(x.joints)), axis=1, keepdims=True)
@@ -298,8 +299,8 @@ def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
 
 def _nonlinear(x: Inputs) -> list[Array]:
     """Coefficients of the local law, and of a skeleton that softens; (T,) each."""
-    law = x.law.coefficients().values()
-    return [*law, *(x.softening or ())]
+    law = x.contact.law.coefficients().values()
+    return [*law, *(x.contact.softening or ())]
 
 
 @made_once(maxsize=64)
@@ -317,9 +318,8 @@ def _generic(
         law = Law(**{"k_1": jnp.exp(v[1]), **parts})
         air = [-0.6, -0.4, -0.2] if line else []
         depths, c = jnp.asarray([*air, *_GENERIC_DEPTHS]), jnp.exp(v[0])
-        softening = Softening(*bent) if bent else None
-        motion = Motion(jnp.zeros(()), depths, onset=v[-2])
-        force = closed.respond(motion, c, law, softening).force + v[-1]
+        contact = Contact(law, v[-2], softening=Softening(*bent) if bent else None)
+        force = closed.respond(depths, c, contact).force + v[-1]
         return force + v[-3] * depths if line else force
 
     J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(4 + len(higher) + line)))

@@ -184,21 +184,36 @@ def unit_deflection(
     return punch.UnitDeflection(unit.w_C, unit.theta_C, unit.w, unit.theta, unit.reaction)
 
 
+class Contact(NamedTuple):
+    """What the force at one contact depends on, beside the skeleton's compliance.
+
+    Attributes:
+        law: of the local indentation.
+        onset: displacement at first touch, mm.
+        blend: rounded corner of a curve whose onset was fitted, mm, see `touch`; None: that of the
+            options.
+        softening: of the skeleton; None where it is linear.
+    """
+
+    law: force_law.Law
+    onset: Float[Array, "*T"]
+    blend: Float[Array, "*T"] | None = None
+    softening: Softening | None = None
+
+
 def respond(
     displacement: Float[Array, "*n"],
-    onset: Float[Array, ""],
     compliance: Float[Array, ""],
-    law: force_law.Law,
+    contact: Contact,
     options: Options,
-    blend: Float[Array, ""] | None = None,
-    softening: Softening | None = None,
 ) -> equilibrium.Equilibrium:
-    """Force and local indentation for a skeleton of known compliance; `blend`: see `touch`.
+    """Force and local indentation for a skeleton of known compliance.
 
     NaN and PULLS where unilateral contact would pull: past the zero of a law that softens, which a
     stiff skeleton reaches before the fold. (A total coupling ends at the law's own fold before it.)
     """
-    moved = touch(displacement, onset, options, blend)
+    law, softening = contact.law, contact.softening
+    moved = touch(displacement, contact.onset, options, contact.blend)
     if options.coupling == "total":
         return equilibrium.press_total(moved, compliance, law)
     if softening is not None:  # which ends at the law's own fold, too
@@ -283,8 +298,8 @@ def _press(
     )
     unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
     law = local_law(geometry, material, s_c, options)
-    softening = softening_of(material, options)
-    solved = respond(displacement, onset, unit.w_C, law, options, blend, softening)
+    contact = Contact(law, onset, blend, softening_of(material, options))
+    solved = respond(displacement, unit.w_C, contact, options)
     unit, solved = hide(refused, unit, solved)
 
     def per_ring(factor, v):

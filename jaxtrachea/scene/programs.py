@@ -10,6 +10,7 @@ from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
 from jaxtrachea.mechanics.press import (
+    Contact,
     ligament_beam,
     local_law,
     respond,
@@ -70,9 +71,8 @@ def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
     def at(s_c, inward):
         unit = unit_deflection(beam, s_c, plan.options)
         law = local_law(geometry, material, s_c, plan.options)
-        rest = jnp.zeros_like(s_c)
-        solved = respond(inward, rest, unit.w_C, law, plan.options, softening=softening)
-        return unit, solved
+        contact = Contact(law, jnp.zeros_like(s_c), softening=softening)
+        return unit, respond(inward, unit.w_C, contact, plan.options)
 
     inward = -presses.displacement[:, 1]
     if plan.contact_point == "fixed":

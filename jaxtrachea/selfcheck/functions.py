@@ -19,7 +19,7 @@ from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, ring_weight
 from jaxtrachea.mechanics.friction import Coulomb, slide
 from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
-from jaxtrachea.mechanics.press import Options, compliance, press
+from jaxtrachea.mechanics.press import Contact, Options, compliance, press
 from jaxtrachea.mechanics.press import respond as touch_and_respond
 from jaxtrachea.mechanics.ring import Ring, respond, ring_compliance
 from jaxtrachea.mechanics.vector_equilibrium import press_vector
@@ -59,7 +59,7 @@ def total(v: Values) -> Answer:
 def first_touch(v: Values) -> Answer:
     """`model.respond`: unilateral contact with the smooth onset of 1e-3 mm, series coupling."""
     law = Law(v["k_1"], v["k_3"])
-    got = touch_and_respond(v["D"], v["onset"], v["c"], law, Options())
+    got = touch_and_respond(v["D"], v["c"], Contact(law, v["onset"]), Options())
     return {"force": got.force, "depth": got.depth}, got.status
 
 

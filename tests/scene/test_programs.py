@@ -25,7 +25,7 @@ from jaxtrachea.contact.pose import Pose
 from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
-from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond, unit_deflection
 from jaxtrachea.mechanics.press import touch as first_touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
@@ -102,7 +102,7 @@ def normal(scene, m, p):
     s, options = used.s[0], Options()
     unit = unit_deflection(ligament_beam(scene.geometry, m, options), s, options)
     law = local_law(scene.geometry, m, s, options)
-    out = respond(inward, jnp.zeros_like(s), unit.w_C, law, options)
+    out = respond(inward, unit.w_C, Contact(law, jnp.zeros_like(s)), options)
     F = -out.force  # outward is +y
     y = F, -out.depth, F * unit.w_C
     force, depth, way = (jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y)

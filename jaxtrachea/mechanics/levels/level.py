@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.softening import Softening
+from jaxtrachea.mechanics.press import Contact
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Declaration
 
@@ -110,8 +109,10 @@ class Closed(Protocol):
         """Motion of C under a unit force there, mm/N, and of every ring if `joints`."""
         ...
 
-    def local(self, tube: Geometry, material: Any, s_c: Any) -> tuple[Law, Softening | None]:
-        """The local law at a position, and how the skeleton softens."""
+    def contact(
+        self, tube: Geometry, material: Any, s_c: Any, onset: Any, blend: Any = None
+    ) -> Contact:
+        """What the force at a position depends on, beside the compliance."""
         ...
 
     def felt(self, compliance: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -122,7 +123,7 @@ class Closed(Protocol):
         """Displacement after first touch, mm."""
         ...
 
-    def respond(self, motion: Motion, compliance: Any, law: Law, softening: Any) -> Any:
+    def respond(self, displacement: Any, compliance: Any, contact: Contact) -> Any:
         """The `Equilibrium` of a press; its derivatives are `equilibrium.sensitivity`."""
         ...
 

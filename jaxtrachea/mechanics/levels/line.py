@@ -12,10 +12,8 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics import press as _press
 from jaxtrachea.mechanics.admission import check_shapes, without_negative
 from jaxtrachea.mechanics.equilibrium import Equilibrium
-from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import DEEP, OF_PRESS, VALUES, Material, material_of
 
@@ -155,12 +153,12 @@ class Line(Level):
         unit = _press.unit_deflection(beam, s_c, self.options)
         return unit.w_C, unit.w
 
-    def local(
-        self, tube: Geometry, material: Material, s_c: Float[Array, ""]
-    ) -> tuple[Law, Softening | None]:
+    def contact(
+        self, tube: Geometry, material: Material, s_c: Any, onset: Any, blend: Any = None
+    ) -> _press.Contact:
         """See `Closed`."""
         law = _press.local_law(tube, material, s_c, self.options)
-        return law, _press.softening_of(material, self.options)
+        return _press.Contact(law, onset, blend, _press.softening_of(material, self.options))
 
     def felt(self, compliance: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """None with the paper's total coupling."""
@@ -170,12 +168,6 @@ class Line(Level):
         """See `press.touch`."""
         return _press.touch(displacement, onset, self.options, blend)
 
-    def respond(
-        self, motion: Motion, compliance: Any, law: Law, softening: Softening | None
-    ) -> Equilibrium:
+    def respond(self, displacement: Any, compliance: Any, contact: _press.Contact) -> Equilibrium:
         """See `press.respond`."""
-        assert motion.onset is not None
-        return _press.respond(
-            motion.displacement, motion.onset, compliance, law, self.options, motion.blend,
-            softening,
-        )  # fmt: skip
+        return _press.respond(displacement, compliance, contact, self.options)
