@@ -126,8 +126,12 @@ class DataSection(Section):
     """samples below are dropped"""
     displacement_max: Length | None = None
     """samples above are dropped"""
-    loading: Literal["last", "first", "loading", "all", "require-monotone"] = "last"
-    """the last full loading, the first, every sample, or every sample of records that only load"""
+    loading: Literal["last", "first", "loading", "record", "all", "require-monotone"] = "last"
+    """the last full loading, the first, the whole record by its time (for a model that relaxes),
+    every sample, or every sample of records that only load
+    """
+    samples: int | None = Field(default=None, ge=20)
+    """about how many samples a record is averaged to, in blocks (`loading = "record"`)"""
     force_sign: Literal[1, -1] = 1
     """-1 if the file counts resisting force negative; turns the side force too"""
     displacement_sign: Literal[1, -1] = 1

@@ -1,5 +1,6 @@
 """The checks every curve passes, whatever its file: sign, loading branch, window, plausibility."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -13,12 +14,22 @@ from jaxtrachea.measurements.loading import (
     usage_of,
 )
 from jaxtrachea.measurements.machine import without_machine
+from jaxtrachea.measurements.observed import OBSERVED
+from jaxtrachea.measurements.segments import Segments
 from jaxtrachea.measurements.vectors import (
     check_vector_shapes,
     check_vector_sizes,
     listed,
     unit_direction,
     vectors_of,
+)
+from jaxtrachea.measurements.whole_record import (
+    averaged,
+    averaged_noise,
+    block_edges,
+    check_rest,
+    kept,
+    rise_of,
 )
 
 #: Positions that differ by less, mm and rad, are one: a stage of the rig stands no steadier.
@@ -70,12 +81,18 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     displacement = without_machine(displacement, force, options.compliance_mm_N)
     found = segments_of(raw, displacement, force, options)
     faulty = faults_of(displacement, force, found, options)
-    keep = selection(displacement, found, options) & ~(faulty.broken | faulty.saturated)
+    whole = found if options.loading == "record" else None
+    flawed = faulty.broken | faulty.saturated
+    if whole is None:
+        keep = selection(displacement, found, options) & ~flawed
+    else:
+        check_rest(displacement, force, whole)
+        keep = kept(flawed)
     _check_amount(keep, displacement, options)
     if options.loading == "require-monotone":
         check_one_loading(raw, displacement, keep, found)
     _check_signal(displacement[keep], force[keep])
-    return Curve(
+    curve = Curve(
         specimen=raw.specimen,
         trial=raw.trial,
         s_c=s_c,
@@ -90,6 +107,26 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         conditions=raw.conditions,
         **vectors_of(raw, keep, options),
     )
+    return curve if whole is None else _as_it_went(curve, whole, options.samples)
+
+
+def _as_it_went(curve: Curve, found: Segments, samples: int | None) -> Curve:
+    """A whole record with its first loading, averaged in blocks where it is longer."""
+    size = len(curve.force)
+    start, stop = rise_of(found, size)
+    if samples is None or size <= samples:
+        return dataclasses.replace(curve, rise=(start, stop))
+    edges = block_edges(found, size, samples)
+    arrays = ("displacement", "force", "time", *(q.name for q in OBSERVED if q.gaps))
+    changed = {n: averaged(v, edges) for n in arrays if (v := getattr(curve, n)) is not None}
+    if curve.sigma is not None:
+        changed["sigma"] = averaged_noise(curve.sigma, edges)
+    rise = (int(np.searchsorted(edges, start)), int(np.searchsorted(edges, stop)))
+    usage = curve.usage
+    if usage is not None:
+        said = f"averaged to {len(edges)} samples"
+        usage = dataclasses.replace(usage, remarks=(*usage.remarks, said))
+    return dataclasses.replace(curve, rise=rise, usage=usage, **changed)
 
 
 def _check_shapes(raw: RawCurve) -> None:

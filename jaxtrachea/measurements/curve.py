@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Integer
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.measurements.observed import OBSERVED
 from jaxtrachea.measurements.roles import RING_ROLES, ROLES, is_role, role_dimension
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.units import UnitError, parse_quantity, unit_factor
@@ -73,6 +74,8 @@ class Curve:
         time: (N,) s of each sample, never falling but with ``loading = "all"``, or None.
         conditions: names and numbers that a file gives for the whole curve and that nothing reads
             (speed, temperature, cycle), as they stand there.
+        rise: first sample of the first loading and first after it, where the curve is a whole
+            record (``loading = "record"``); else None.
     """
 
     specimen: str
@@ -94,6 +97,17 @@ class Curve:
     end_V: Float64[np.ndarray, "n k 2"] | None = None
     time: Float64[np.ndarray, " n"] | None = None
     conditions: tuple[tuple[str, float], ...] = ()
+    rise: tuple[int, int] | None = None
+
+    @property
+    def rising(self) -> "Curve":
+        """The first loading of a whole record; else the curve itself."""
+        if self.rise is None:
+            return self
+        part = slice(*self.rise)
+        arrays = ("displacement", "force", "sigma", "time", *_OF_SAMPLES)
+        cut = {n: v[part] for n in arrays if (v := getattr(self, n)) is not None}
+        return dataclasses.replace(self, rise=None, **cut)
 
 
 @dataclass(frozen=True)
@@ -159,7 +173,9 @@ class RawCurve:
 
 
 #: "loading" means "first".
-LOADINGS = ("last", "first", "loading", "all", "require-monotone")
+LOADINGS = ("last", "first", "loading", "record", "all", "require-monotone")
+#: Fields of a curve that have a value for every sample, beside displacement, force, noise, time.
+_OF_SAMPLES = tuple(q.name for q in OBSERVED if q.gaps)
 
 
 @dataclass(frozen=True)
@@ -183,8 +199,9 @@ class ReadOptions:
         displacement_min: drop samples below, mm.
         displacement_max: drop samples above, mm.
         loading: "last" or "first" (that full loading, from its foot to its peak, without holds;
-            "loading" is "first"), "all" (every sample) or "require-monotone" (a record that is
-            more than one loading, or holds its peak, is bad).
+            "loading" is "first"), "record" (from rest before first touch to the end, with holds,
+            cycles and unloading: needs time, and a model that relaxes), "all" (every sample) or
+            "require-monotone" (a record that is more than one loading, or holds its peak, is bad).
         force_sign: -1 if the file counts the resisting force negative; it turns the whole force,
             `side_force` too.
         displacement_sign: -1 if the file counts inward displacement of the tool negative; it turns
@@ -193,6 +210,8 @@ class ReadOptions:
             force is taken off the displacement, both with their signs. Or a table of names of
             files, or patterns, to such quantities (the first that fits counts; a file that none
             fits is an error), for `read_measurements`.
+        samples: of a whole record, to which it is averaged in blocks (even in ramps, growing in
+            holds): about so many; None: all are kept.
         sheet: name of the sheet of a workbook that holds the table, or a pattern ("Trial *"), or
             several of them; of several sheets each is a trial. None: the first that is not hidden.
         min_points: fewest samples of a curve.
@@ -216,6 +235,7 @@ class ReadOptions:
     force_sign: int = 1
     displacement_sign: int = 1
     machine_compliance: str | Mapping[str, str] | None = None
+    samples: int | None = None
     sheet: str | Sequence[str] | None = None
     min_points: int = 2
     max_displacement: float = 1000.0
@@ -240,6 +260,16 @@ class ReadOptions:
             if role in ("specimen", "trial"):
                 raise ValueError(f"units: {role} is a name and has no unit; remove it")
             _named(f"units.{role}", unit_factor, unit, role_dimension(role))
+        window = self.displacement_min is not None or self.displacement_max is not None
+        if self.loading == "record" and window:
+            raise ValueError(
+                "displacement_min and displacement_max take samples out of a record that remembers "
+                'them; remove them, or use another loading than "record"'
+            )
+        if self.samples is not None and (self.samples < 20 or self.loading != "record"):
+            raise ValueError(
+                f'samples is {self.samples}; expected 20 or more, of records (loading = "record")'
+            )
         if self.min_points < 2:
             raise ValueError(f"min_points must be at least 2, got {self.min_points}")
         low, high = self.displacement_min, self.displacement_max

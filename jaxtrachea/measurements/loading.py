@@ -9,6 +9,7 @@ from jaxtrachea.measurements.plausible import doubt, drawn
 from jaxtrachea.measurements.record_faults import Faults, faults
 from jaxtrachea.measurements.segments import JITTER, NoLoading, Segments, segment
 from jaxtrachea.measurements.usage import CHOOSING, Usage, lasting, usage
+from jaxtrachea.measurements.whole_record import check_clock, remarks_of
 
 
 def usage_of(
@@ -25,6 +26,9 @@ def usage_of(
     seen = usage(displacement, keep, found, options.loading, unit, faulty)
     taken = displacement[keep], force[keep]
     doubts = [said for said in (doubt(*taken), drawn(*taken)) if said is not None]
+    if found is not None and raw.time is not None and options.loading in (*CHOOSING, "record"):
+        whole = options.loading == "record"
+        doubts += remarks_of(raw.time, displacement, found, whole=whole)
     return dataclasses.replace(seen, remarks=(*seen.remarks, *doubts)) if doubts else seen
 
 
@@ -36,7 +40,10 @@ def segments_of(
     if options.loading == "all" and time is not None and (time[1:] < time[:-1]).any():
         time = None
     _check_time(raw, time)
-    first = options.loading in ("first", "loading")
+    whole = options.loading == "record"
+    if whole:
+        check_clock(time)
+    first = whole or options.loading in ("first", "loading")
     try:
         return segment(displacement, force, time, first=first)
     except NoLoading as error:

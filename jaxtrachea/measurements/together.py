@@ -46,7 +46,8 @@ def finish_all(
         For each record what `finish` makes of it.
     """
     done: list[Curve | BadCurve | None] = [None] * len(records)
-    if options.compliance_mm_N > 0:  # noise of the force is one of the displacement then
+    # Noise of the force is one of the displacement then; a whole record has its own way.
+    if options.compliance_mm_N > 0 or options.loading == "record":
         return [r if isinstance(r, BadCurve) else finish(r, options) for r in records]
     common = (options.s_mm, options.phi_rad)
     for picked in _blocks(records):

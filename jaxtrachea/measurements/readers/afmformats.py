@@ -12,7 +12,8 @@ bending takes back F/k. The displacement of the tip, counted from the first samp
 h: "height (measured)", which falls on approach; F: force, positive when repelled; k: the metadata
 "spring constant". Where the file holds "tip position" p, D_i = p_0 - p_i. Approach before contact
 counts into D, and force offsets stay: finding the contact point is not the reader's business. Only
-segment 0 (approach) is kept, unless every sample is asked for with ``loading = "all"``.
+segment 0 (approach) is kept, unless all of it is asked for with ``loading = "all"`` or
+``"record"``.
 """
 
 import importlib
@@ -270,7 +271,7 @@ def _curve(
     force = _column(options.columns.get("force", "force"), "force", columns, units, source, options)
     position = _tip_position(force, columns, units, metadata, source, options)
     keep = np.ones(force.shape, dtype=bool)
-    if "segment" in columns and options.loading != "all":
+    if "segment" in columns and options.loading not in ("all", "record"):
         if columns["segment"].shape != force.shape:
             raise Fault("shape", "segment and force differ in length", "export again")
         keep = columns["segment"] == 0
