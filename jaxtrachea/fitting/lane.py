@@ -32,6 +32,9 @@ class Lane(NamedTuple):
         lower: bounds of the unknowns in scaled coordinates; (P,).
         upper: (P,).
         active: whether the unknown exists in this lane; (P,).
+        time: of every sample, s, from the first on; (T, N); padding repeats the last. None: the
+            model has no time.
+        rising: which samples are of the first loading, 1 or 0; (T, N); with `time`.
         phi_c: contact angle, rad; (T,); None where all trials of the study press along the normal
             on the midline. This and all below: deforming cross-sections alone.
         direction: of the tool along the inward normal and the circumference; (T, 2); with `phi_c`.
@@ -56,6 +59,8 @@ class Lane(NamedTuple):
     lower: Float[Array, "*l P"]
     upper: Float[Array, "*l P"]
     active: Float[Array, "*l P"]
+    time: Float[Array, "*l T N"] | None = None
+    rising: Float[Array, "*l T N"] | None = None
     phi_c: Float[Array, "*l T"] | None = None
     direction: Float[Array, "*l T 2"] | None = None
     side_force: Float[Array, "*l T N"] | None = None

@@ -179,6 +179,7 @@ class _Layout:
         unknowns: of a lane, at most.
         joints: whether any curve has markers, or ring ends.
         vectors: whether the model shows more than normal forces and motions on the midline.
+        time: whether it relaxes.
         curves: all of them.
     """
 
@@ -192,6 +193,7 @@ class _Layout:
     unknowns: int
     joints: bool
     vectors: bool
+    time: bool
     curves: Sequence[Curve]
 
 
@@ -236,6 +238,7 @@ def lanes_of(
     weighting: Weighting,
     tool_radius: float | None,
     vectors: bool = False,
+    time: bool = False,
 ) -> Lane:
     """The lanes of a study, stacked along a leading axis.
 
@@ -248,6 +251,7 @@ def lanes_of(
         weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
         tool_radius: see `study.build_study`.
         vectors: see `Lane.phi_c`; whether the model reads what is below it there.
+        time: whether the model relaxes: every curve has its time.
     """
     every = [c for curves in groups for c in curves]
     lengths = [len(c.force) for c in every]
@@ -262,6 +266,7 @@ def lanes_of(
         unknowns=max(map(len, unknowns)),
         joints=any(_has_motion(c, vectors=vectors) for c in every),
         vectors=vectors,
+        time=time,
         curves=every,
     )
     lanes = [_lane(layout, *lane) for lane in zip(groups, unknowns, strict=True)]
@@ -290,6 +295,8 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
     }
     if layout.vectors:
         lane |= _blank_vectors(layout)
+    if layout.time:
+        lane |= {"time": np.zeros((T, N)), "rising": np.zeros((T, N))}
     place = {key: i for i, key in enumerate(unknowns)}
     for i, (p, _, _) in enumerate(unknowns):
         lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
@@ -299,6 +306,10 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
         if curve.s_c is not None:
             lane["s_c"][t] = curve.s_c
         lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
+        if layout.time and curve.time is not None:
+            lane["time"][t] = curve.time[-1] - curve.time[0]
+            lane["time"][t, :n] = curve.time - curve.time[0]
+            lane["rising"][t, slice(*(curve.rise or (0, n)))] = 1
         sigma = curve.sigma if curve.sigma is not None else noise.force
         lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
         for j, p in enumerate(parameters):

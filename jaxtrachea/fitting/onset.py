@@ -55,11 +55,13 @@ def touches(
 ) -> FirstTouch:
     """Change point of every trial with an onset or an offset, see `first_touch`; (lanes, T) each.
 
-    NaN of others. `slope`: of the force without contact, which is taken off, N/mm; NaN: 0.
+    NaN of others. Of a whole record the first loading shows it. `slope`: of the force without
+    contact, which is taken off, N/mm; NaN: 0.
     """
     shape, samples = lanes.s_c.shape, lanes.force.shape[-1]
+    precision = lanes.precision if lanes.rising is None else lanes.precision * lanes.rising
     displacement, force, precision = (
-        np.reshape(v, (-1, samples)) for v in (lanes.displacement, lanes.force, lanes.precision)
+        np.reshape(v, (-1, samples)) for v in (lanes.displacement, lanes.force, precision)
     )
     if slope is not None:
         force = force - np.nan_to_num(slope).reshape(-1, 1) * displacement

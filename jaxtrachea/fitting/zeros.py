@@ -94,6 +94,7 @@ def zeros_of(
         sigma: as for `resolved`.
         table: whose fixed onset and force offset, if any, are taken off the records first.
     """
+    curves = [c.rising for c in curves]
     given = [sigma if c.sigma is None else float(np.median(c.sigma)) for c in curves]
     held = {p.name: p.value for p in table if p.fixed and not p.auto}
     onset, offset = held.get("onset", 0.0), held.get("force_offset", 0.0)

@@ -40,7 +40,9 @@ def where_missed(result: FitResult, lane: int) -> str:
     residual, curves = result.residuals.force[lane], result.study.curves[lane]
     curve, row = max(zip(curves, residual, strict=False), key=lambda pair: float(rms(pair[1])))
     known = np.flatnonzero(np.isfinite(row))
-    order = known[np.argsort(curve.displacement[known], kind="stable")]
+    order = known
+    if curve.rise is None:  # else as it went
+        order = known[np.argsort(curve.displacement[known], kind="stable")]
     depth, r = curve.displacement[order], row[order]
     width = min(_WINDOW, len(r))
     smooth = np.convolve(r, np.full(width, 1 / width), "same")
