@@ -23,8 +23,9 @@ def serves(study: Study, settings: Settings, starts: int) -> bool:
     Not of short curves, nor of so few starts that compiling takes longer (`QUICK`). Nor where the
     few may not tell: a force that remembers what lies between them, markers (seen in some samples
     alone), the samples next to a fitted onset, the outliers of a robust loss. Nor where no doubt is
-    followed up afterwards: what is one minimum of the few may be two of all. Joint studies, deforming cross-sections, single precision, other
-    solvers and other devices than CPUs, where nothing was measured, go their own way.
+    followed up afterwards: what is one minimum of the few may be two of all. Joint studies,
+    deforming cross-sections, single precision, other solvers and other devices than CPUs, where
+    nothing was measured, go their own way.
     """
     lanes, model = study.lanes, study.model
     long = lanes.force.shape[-1] >= TIMES * KEPT and starts > QUICK[0]
