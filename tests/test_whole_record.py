@@ -1,0 +1,163 @@
+"""Records as they went: which samples, what is told of speeds and holds, what is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxtrachea.measurements.checks import finish
+from jaxtrachea.measurements.curve import BadCurve, Curve, RawCurve, ReadOptions
+from jaxtrachea.measurements.segments import segment
+from jaxtrachea.measurements.whole_record import averaged, averaged_noise, block_edges
+
+#: Rest, a ramp of 2 mm/s, a hold, unloading at 1.5 mm/s, a second, smaller press of 2 mm/s.
+CORNERS = np.array([0.0, 2.0, 4.0, 14.0, 16.0, 20.0, 21.0, 29.0])
+WAY = np.array([-1.0, -1.0, 3.0, 3.0, 0.0, 0.0, 2.0, 2.0])
+#: Strength and time of the branch, N/mm, s.
+GAMMA, TAU, STIFF = 0.9, 1.0, 0.3
+
+
+def force_of(time, depth):
+    """A spring beside one branch, step by step, each exact for a straight way."""
+    held, before, out = 0.0, 0.0, []
+    for dt, e in zip(
+        np.diff(time, prepend=time[0] - 1e-9), STIFF * np.maximum(depth, 0), strict=True
+    ):
+        x = dt / TAU
+        held = np.exp(-x) * held - GAMMA * np.expm1(-x) / x * (e - before)
+        before = e
+        out.append(max(e + held, 0.0))
+    return np.array(out)
+
+
+def record(**changes):
+    rng, time = np.random.default_rng(0), np.arange(0.0, 30.0, 0.01)
+    depth = np.interp(time, CORNERS, WAY)
+    force = force_of(time, depth) + rng.normal(0, 0.002, time.size)
+    noisy = depth + rng.normal(0, 1e-4, time.size)
+    raw = RawCurve("a", "t", "file", noisy, force, np.arange(time.size), s=20.0, time=time)
+    return dataclasses.replace(raw, **changes)
+
+
+WHOLE = ReadOptions(loading="record")
+
+
+def test_all_of_it_is_used_and_its_first_loading_is_known():
+    curve = finish(record(), WHOLE)
+    assert isinstance(curve, Curve)
+    assert len(curve.force) == len(curve.time) == 3000
+    rising = curve.rising
+    assert rising.rise is None
+    assert rising.displacement[0] == pytest.approx(-1, abs=0.02)
+    assert rising.displacement[-1] == pytest.approx(3, abs=0.02)
+    assert rising.time[-1] == pytest.approx(4, abs=0.1)
+    told = " ".join(curve.usage.remarks)
+    assert "ramps of 1.5 to 2 mm/s" in told
+    # The hold begins at exp(-0) of what the ramp has left of the branch, and ends at none of it.
+    ramp = GAMMA * TAU / 1.5 * (1 - np.exp(-1.5 / TAU))
+    fall = 100 * ramp / (1 + ramp)
+    assert f"the force falls by up to {fall:.2g} %" in told
+
+
+def test_an_elastic_fit_is_told_of_which_speed_its_stiffness_is():
+    told = finish(record(), ReadOptions(loading="first")).usage.remarks
+    assert any(remark.startswith("k_1 is that of 2 mm/s: in the hold the force") for remark in told)
+
+
+def test_blocks_keep_corners_and_means():
+    raw = record(sigma=np.full(3000, 0.1))
+    curve = finish(raw, dataclasses.replace(WHOLE, samples=400))
+    assert 300 < len(curve.force) <= 420
+    found = segment(raw.displacement, raw.force, raw.time, first=True)
+    edges = block_edges(found, 3000, 400)
+    starts = [part.start for part in found.parts]
+    assert np.isin(starts, edges).all()
+    count = np.diff(np.append(edges, 3000))
+    for values in (raw.force, raw.displacement, raw.time):
+        assert averaged(values, edges) @ count / 3000 == pytest.approx(values.mean(), rel=1e-12)
+    np.testing.assert_allclose(averaged_noise(raw.sigma, edges), 0.1 / np.sqrt(count), rtol=1e-12)
+    np.testing.assert_allclose(curve.sigma, 0.1 / np.sqrt(count), rtol=1e-12)
+    # Where the hold begins blocks are single samples, and grow.
+    hold = next(part for part in found.parts if part.kind == "hold")
+    of_hold = count[(edges >= hold.start) & (edges < hold.stop)]
+    assert (of_hold[:5] == 1).all()
+    assert of_hold[-2] > 20
+
+
+def test_markers_are_averaged_and_gaps_stay():
+    moved = np.ones((3000, 2))
+    moved[500, 1] = np.nan
+    raw = record(joint_rings=np.array([3, 4]), joint_displacement=moved)
+    curve = finish(raw, dataclasses.replace(WHOLE, samples=400))
+    assert curve.joint_displacement.shape == (len(curve.force), 2)
+    assert (curve.joint_displacement[:, 0] == 1).all()
+    assert np.isnan(curve.joint_displacement[:, 1]).sum() == 1
+
+
+STILL = np.repeat(np.arange(0.0, 30.0, 0.1), 10)
+BACK = np.concatenate([np.arange(0.0, 15.0, 0.01), np.arange(0.0, 15.0, 0.01)])
+REFUSED = {
+    "no time": ({"time": None}, 'there is no time, which loading = "record" needs'),
+    "it stands still": ({"time": STILL}, "time stands still in 2700 of 2999 steps"),
+    "it falls": ({"time": BACK}, "time falls from 14.99 to 0 s"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), REFUSED.values(), ids=REFUSED)
+def test_time_that_is_none_is_refused(changes, message):
+    done = finish(record(**changes), WHOLE)
+    assert isinstance(done, BadCurve)
+    assert (done.kind, message in done.message) == ("time", True)
+    assert 'loading = "' in done.cure
+
+
+def test_a_record_that_begins_pressed_is_refused():
+    raw = record()
+    cut = {n: getattr(raw, n)[300:] for n in ("displacement", "force", "rows", "time")}
+    done = finish(dataclasses.replace(raw, **cut), WHOLE)
+    assert isinstance(done, BadCurve)
+    assert "begins with" in done.message
+    assert "what relaxes from before is not known" in done.message
+
+
+def test_a_force_that_moves_before_the_tool_is_refused():
+    raw = record()
+    falls = raw.force + 0.3 * np.exp(-raw.time / 0.8)
+    done = finish(dataclasses.replace(raw, force=falls), WHOLE)
+    assert isinstance(done, BadCurve)
+    assert "before the tool does: the record does not begin at rest" in done.message
+
+
+def test_an_offset_of_the_load_cell_is_no_preload():
+    raw = record()
+    assert isinstance(finish(dataclasses.replace(raw, force=raw.force + 0.4), WHOLE), Curve)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_a_time_in_another_unit_is_doubted(factor):
+    raw = record()
+    told = finish(dataclasses.replace(raw, time=raw.time * factor), WHOLE).usage.remarks
+    assert any("is the unit of time right?" in remark for remark in told)
+
+
+def test_what_ends_the_record_ends_it_for_good():
+    """After a break nothing counts: what follows remembers it."""
+    raw = record()
+    force = raw.force.copy()
+    force[330:] *= 0.3
+    curve = finish(dataclasses.replace(raw, force=force), WHOLE)
+    assert isinstance(curve, Curve)
+    assert 320 < len(curve.force) <= 330
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"loading": "record", "displacement_max": 2.0}, "take samples out of a record"),
+        ({"loading": "record", "samples": 5}, "expected 20 or more"),
+        ({"samples": 100}, 'of records \\(loading = "record"\\)'),
+    ],
+)
+def test_options_that_cannot_be(options, message):
+    with pytest.raises(ValueError, match=message):
+        ReadOptions(**options)
