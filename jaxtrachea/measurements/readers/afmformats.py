@@ -203,7 +203,8 @@ def _read_tab(path: Path, who: FileIdentity, options: ReadOptions) -> RawCurve |
 
 def _wanted(options: ReadOptions) -> set[str]:
     chosen = {options.columns[r] for r in ("displacement", "force") if r in options.columns}
-    return {"force", "height (measured)", "tip position", "segment"} | chosen
+    timed = {"time"} if options.loading == "record" else set()
+    return {"force", "height (measured)", "tip position", "segment"} | chosen | timed
 
 
 def _truth(cell: str) -> str:
@@ -277,9 +278,14 @@ def _curve(
         keep = columns["segment"] == 0
     position, force, rows = position[keep], force[keep], rows[keep]
     displacement = position[:1] - position if position.size else position
+    time = None
+    if options.loading == "record" and "time" in columns:
+        name = options.columns.get("time", "time")
+        time = np.atleast_1d(convert(columns[name], units[name] or "s", "time"))
     return RawCurve(
-        who.specimen, trial, source, displacement, force, rows, row_word, s=who.s, phi=who.phi
-    )
+        who.specimen, trial, source, displacement, force, rows, row_word, s=who.s, phi=who.phi,
+        time=time,
+    )  # fmt: skip
 
 
 def _tip_position(
