@@ -18,6 +18,7 @@ import dataclasses
 import functools
 import math
 import os
+import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -42,7 +43,9 @@ MARKS = "one_kernel", "hidden"
 SUPPORTED_JAXLIB = ("0.10.2", "0.11.2", "0.12.0.1")
 
 
-def fuse(part: Callable[..., Out], *, products: bool = False) -> Callable[..., Out]:
+def fuse(
+    part: Callable[..., Out], *, products: bool = False, streams: bool = False
+) -> Callable[..., Out]:
     """The same function, compiled into a single kernel: one call at a time, on a CPU.
 
     For programs of many small operations, whose time goes into starting kernels. It works where
@@ -61,8 +64,10 @@ def fuse(part: Callable[..., Out], *, products: bool = False) -> Callable[..., O
         products: whether products of matrices of at most 64 terms are written out as sums, so that
             they can be part of the kernel; a batch has the library's, which are quicker there.
             Twice backwards through a loop then only from JAX 0.11 on.
+        streams: whether arrays of any size are taken: of a loop whose rounds wait for each other,
+            and each read a slice, there is nothing for a second thread to do.
     """
-    return _called(part, _kernel_of_products if products else _kernel)
+    return _called(part, _kernel_of_products if products else _kernel, streams=streams)
 
 
 def map_sequentially(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -80,7 +85,9 @@ def map_sequentially(part: Callable[..., Out]) -> Callable[..., Out]:
     return _called(part, _in_turn)
 
 
-def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
+def _called(
+    part: Callable[..., Out], how: Callable, *, streams: bool = False
+) -> Callable[..., Out]:
     """The part as a call of its own, made by `how`; as it is where a kernel cannot hold it."""
 
     def run(*arguments):
@@ -116,7 +123,7 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
         if kernel:
             products = how is _kernel_of_products
             alone = written_out(jax.make_jaxpr(plain)(*inputs)).jaxpr if products else jaxpr
-            if not fits_one_kernel(alone):
+            if not fits_one_kernel(alone, sys.maxsize if streams else SMALL):
                 return part(*arguments)
         found = _differentiable(plain, changing, how)(*inputs)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
@@ -281,16 +288,16 @@ SMALL = 1 << 16
 REDUCED = 4000
 
 
-def fits_one_kernel(jaxpr: Jaxpr) -> bool:
-    """Whether all that is computed can be in one kernel, and all arrays are small."""
+def fits_one_kernel(jaxpr: Jaxpr, most: int = SMALL) -> bool:
+    """Whether all that is computed can be in one kernel, and no array has more entries."""
     results = [v for eqn in jaxpr.eqns for v in eqn.outvars]
     arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *results)
-    if not all(_entries(v) <= SMALL for v in arrays):
+    if not all(_entries(v) <= most for v in arrays):
         return False
     return all(
         eqn.primitive.name in FITTING
         and (not _reduces(eqn) or all(_entries(v) <= REDUCED for v in eqn.invars))
-        and all(fits_one_kernel(sub) for sub in _inside(eqn))
+        and all(fits_one_kernel(sub, most) for sub in _inside(eqn))
         for eqn in jaxpr.eqns
     )
 

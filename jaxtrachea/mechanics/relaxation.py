@@ -1,0 +1,371 @@
+r"""A force that relaxes: branches, each a spring and a dashpot, beside an elastic force (Fung).
+
+Of the elastic force e and branches b of strength gamma_b and time tau_b the whole force is
+
+    F = e + sum_b h_b,   dh_b/dt = gamma_b de/dt - h_b / tau_b,
+
+so that e is what lasts and (1 + sum_b gamma_b) e what a sudden press meets. If all parts of the
+organ relax alike, its shape is the elastic one at every instant, and F is this filter of the
+elastic force of the whole: of any law, skeleton, width or direction (quasi-linear, Fung). How the
+tool came to the place does not matter, only the elastic force and the time.
+
+A step is exact for an e that is linear in time between samples, for any dt >= 0 (dt = 0: a jump):
+
+    h' = E h + P (e' - e),   E = exp(-x),   P = gamma (1 - E) / x,   x = dt / tau.
+
+A unilateral contact does not pull: where F would be negative it is 0, the tool has left, and the
+surface recovers by itself, e' = -B / A with A = 1 + sum P and B = sum (E h - P e).
+
+Nothing here knows what the elastic force is of.
+"""
+
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Float
+
+from jaxtrachea._numerics import added
+from jaxtrachea.fusion import fuse
+
+
+class Branches(NamedTuple):
+    """Branches of a relaxation.
+
+    Attributes:
+        gamma: strength over that of the force that lasts; not negative; (B,).
+        tau: relaxation time, s; (B,). 0 and very small: nothing is left of the branch at the next
+            sample; infinite: it does not relax.
+    """
+
+    gamma: Float[Array, " B"]
+    tau: Float[Array, " B"]
+
+
+class Relaxed(NamedTuple):
+    """A force in time.
+
+    Attributes:
+        force: N; (N,) or (N, 3) as the elastic force is.
+        elastic: elastic force of the surface as it is, N: that of the tool's displacement, or where
+            the tool has left what the surface itself still has.
+    """
+
+    force: Float[Array, " N *k"]
+    elastic: Float[Array, " N *k"]
+
+    @property
+    def overload(self) -> Float[Array, " N *k"]:
+        """What the branches carry beside the elastic force, N."""
+        return self.force - self.elastic
+
+
+class Derivatives(NamedTuple):
+    """Derivatives of a `Relaxed`: first by the columns of the elastic force, then by the branches.
+
+    Attributes:
+        force: (C + K, N).
+        elastic: (C + K, N); None where it was not asked for.
+    """
+
+    force: Float[Array, "CK N"]
+    elastic: Float[Array, "CK N"] | None
+
+
+def relax(
+    time: Float[Array, " N"],
+    elastic: Float[Array, " N *k"],
+    branches: Branches,
+    unilateral: bool = True,
+) -> Relaxed:
+    """The force of an elastic force that relaxes, from rest before the first sample.
+
+    Derivatives of any order, in both modes, are those of the steps.
+
+    Args:
+        time: s, never falling. Padding repeats the last time and any finite elastic force, at the
+            end: no sample feels a later one.
+        elastic: what the displacement would meet in the long run, N; a vector (last axis) where the
+            contact cannot let go. What is not finite leaves all later samples so.
+        branches: see `Branches`.
+        unilateral: the contact lets go where it would pull; else it is bonded (static).
+
+    Raises:
+        ValueError: vectors of a unilateral contact.
+    """
+    if elastic.ndim > 1:
+        if unilateral:
+            raise ValueError("a vector has no sign to let go at; expected unilateral=False")
+        return jax.vmap(lambda e: relax(time, e, branches, False), -1, -1)(elastic)
+    x, lost = _fading(time, branches)
+    if unilateral:
+        return Relaxed(*_filter(x, lost, elastic, branches.gamma))
+
+    def bonded(loop):
+        return lambda: loop(x, lost, elastic, branches.gamma)
+
+    # The loop is one kernel on a CPU; elsewhere each of its rounds would be several.
+    force = jax.lax.platform_dependent(cpu=bonded(_bonded_filter), default=bonded(_in_parallel))
+    return Relaxed(force, elastic)
+
+
+def relax_with_derivatives(
+    time: Float[Array, " N"],
+    elastic: Float[Array, " N"],
+    columns: Float[Array, "C N"],
+    branches: Branches,
+    unilateral: bool = True,
+    along: Branches | None = None,
+    *,
+    surface: bool = False,
+) -> tuple[Relaxed, Derivatives]:
+    """`relax` and its derivatives, carried beside it: a third of what `jax.jvp` of it takes.
+
+    Args:
+        time: s; as in `relax`.
+        elastic: N.
+        columns: derivatives of the elastic force by whatever it depends on.
+        branches: see `Branches`.
+        unilateral: as in `relax` (static).
+        along: changes of gamma and tau in K directions, each (K, B), as `jax.jvp` of what makes the
+            branches gives them; None: the 2 B of the logarithm of each gamma, then of each tau.
+        surface: whether derivatives of `Relaxed.elastic` are asked for, which joints follow
+            (static).
+
+    Returns:
+        The force, and its derivatives by the C columns and along the K directions.
+    """
+    if along is None:
+        gamma, tau = jnp.diag(branches.gamma), jnp.diag(branches.tau)
+        zero = jnp.zeros_like(gamma)
+        along = Branches(jnp.concatenate([gamma, zero]), jnp.concatenate([zero, tau]))
+    # A branch that never relaxes has no change of log tau.
+    log_tau = jnp.where(along.tau == 0, 0, along.tau / branches.tau[None])
+    x, lost = _fading(time, branches)
+    loop = functools.partial(_loop_with_derivatives, unilateral=unilateral, surface=surface)
+    # Samples and branches in front, as the loop reads them.
+    force, of_surface, d_force, d_surface = _lanes_last(loop)(
+        x, lost, elastic, columns.T, branches.gamma, along.gamma.T, log_tau.T
+    )
+    d_surface = None if d_surface is None else d_surface.T
+    return Relaxed(force, of_surface), Derivatives(d_force.T, d_surface)
+
+
+# Steps
+
+
+def _fading(time, branches: Branches):
+    """Steps over relaxation times, (N, B), and what they take of a branch: expm1(-x)."""
+    dt = jnp.diff(time, prepend=time[:1])
+    x = _over(dt[:, None], branches.tau[None])
+    return x, _lost(x)
+
+
+@jax.custom_jvp
+def _over(dt, tau):
+    """Steps over relaxation times; where it is 1e154 (float32: 1e19) a branch is 0 anyway."""
+    limits = jnp.finfo(tau.dtype)
+    return jnp.minimum(dt / jnp.maximum(tau, limits.tiny), math.sqrt(float(limits.max)))
+
+
+@_over.defjvp
+def _over_jvp(primals, tangents):
+    """In an order that keeps changes in log tau finite where tau^2 is not."""
+    x, limits = _over(*primals), jnp.finfo(primals[1].dtype)
+    tau = jnp.maximum(primals[1], limits.tiny)
+    free = x < math.sqrt(float(limits.max))
+    return x, jnp.where(free, (tangents[0] - x * tangents[1]) / tau, 0)
+
+
+#: Of the numbers of each size: the parts of log 2 (the first with few bits, so that its products
+#: with small integers are exact), the terms of the series, integers of that size, bits of the
+#: mantissa, exponent of 1, and the largest x.
+_EXPM1 = {
+    8: (6.93147180369123816490e-01, 1.90821492927058770002e-10, 13, jnp.int64, 52, 1023, 700.0),
+    4: (0.693359375, -2.12194440e-4, 7, jnp.int32, 23, 127, 80.0),
+}
+
+
+@jax.custom_jvp
+def _lost(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """`expm1(-x)` for x >= 0 to an ulp or two: of many numbers three times as quick as XLA's.
+
+    -x = n log 2 + r; of r its series, times 2^n from the bits.
+    """
+    high, low, terms, integer, mantissa, bias, most = _EXPM1[x.dtype.itemsize]
+    y = -jnp.minimum(x, most)
+    n = jnp.round(y * (1 / math.log(2)))
+    r = y - n * high - n * low
+    series = jnp.full_like(r, 1 / math.factorial(terms))
+    for i in range(terms - 1, 0, -1):
+        series = series * r + 1 / math.factorial(i)
+    power = jax.lax.bitcast_convert_type((n.astype(integer) + bias) << mantissa, x.dtype)
+    return power * (series * r) + (power - 1)
+
+
+@_lost.defjvp
+def _lost_jvp(primals, tangents):
+    lost = _lost(*primals)
+    return lost, -(1 + lost) * tangents[0]
+
+
+def _mean(x, lost):
+    """(1 - exp(-x)) / x."""
+    near = x < jnp.finfo(x.dtype).eps
+    return jnp.where(near, 1 - x / 2, -lost / jnp.where(near, 1, x))
+
+
+def _factors(x, lost, gamma):
+    """E, (1 - E) / x and P of each branch, as lists: unrolled, it is vectorised over the lanes."""
+    count = range(gamma.shape[0])
+    mean = [_mean(x[b], lost[b]) for b in count]
+    return [1 + lost[b] for b in count], mean, [gamma[b] * mean[b] for b in count]
+
+
+def _press(kept, share, h, e, elastic, unilateral: bool):
+    """Force, elastic force of the surface, whether the tool has left, and A, of one step."""
+    A = 1 + added(share)
+    B = added(E * h - P * e for E, P, h in zip(kept, share, h, strict=True))
+    force = A * elastic + B
+    left = force < 0
+    if not unilateral:
+        return force, elastic, jnp.zeros_like(left), A
+    return jnp.where(left, 0, force), jnp.where(left, -B / A, elastic), left, A
+
+
+def _loop(x, lost, elastic, gamma, unilateral: bool = True):
+    """Force and elastic force of the surface; arrays may have lanes as their last axis.
+
+    Args:
+        x: see `_fading`; (N, B, *lanes), as `lost`.
+        lost: what a step takes of a branch.
+        elastic: (N, *lanes).
+        gamma: (B, *lanes).
+        unilateral: static.
+    """
+
+    def step(state, sample):
+        h, e = state
+        x, lost, elastic = sample
+        kept, _, share = _factors(x, lost, gamma)
+        force, new, *_ = _press(kept, share, h, e, elastic, unilateral)
+        moved = new - e
+        h = tuple(E * h + P * moved for E, P, h in zip(kept, share, h, strict=True))
+        return (h, new), (force, new)
+
+    zero = jnp.zeros_like(elastic[0])
+    start = (zero,) * gamma.shape[0], zero
+    return jax.lax.scan(step, start, (x, lost, elastic))[1]
+
+
+def _bonded_loop(x, lost, elastic, gamma):
+    return _loop(x, lost, elastic, gamma, False)[0]
+
+
+def _in_parallel(x, lost, elastic, gamma):
+    """`_bonded_loop` by an associative scan: what no sample lets go is linear in all of them."""
+    share = gamma[None] * _mean(x, lost)
+    pushed = share * jnp.diff(elastic, prepend=0)[:, None]
+
+    def after(first, then):
+        return first[0] * then[0], then[0] * first[1] + then[1]
+
+    h = jax.lax.associative_scan(after, (1 + lost, pushed))[1]
+    return elastic + jnp.sum(h, axis=-1)
+
+
+def _loop_with_derivatives(
+    x, lost, elastic, columns, gamma, along_gamma, along_tau, *, unilateral: bool, surface: bool
+):
+    """`_loop`, and derivatives of its results by C columns and along K directions; lanes as there.
+
+    What several results read is stored (`barrier`): XLA would compute it anew for each of them.
+
+    Args:
+        x: see `_loop`, as `lost`, `elastic` and `gamma`.
+        lost: what a step takes of a branch.
+        elastic: N.
+        columns: derivatives of the elastic force; (N, C, *lanes).
+        gamma: of the branches.
+        along_gamma: changes of gamma; (B, K, *lanes).
+        along_tau: of log tau; likewise.
+        unilateral: static.
+        surface: whether derivatives of the surface's elastic force are asked for (static).
+
+    Returns:
+        Force, elastic force, the derivatives of the one and those of the other or None.
+    """
+    barrier, branches = jax.lax.optimization_barrier, range(gamma.shape[0])
+    none_of_columns = jnp.zeros_like(columns[0])
+    none_along = jnp.zeros_like(along_gamma[0])
+
+    def step(state, sample):
+        h, e, dh, de = state
+        x, lost, elastic, columns = sample
+        kept, mean, share = barrier(_factors(x, lost, gamma))
+        force, new, left, A = barrier(_press(kept, share, h, e, elastic, unilateral))
+        moved = new - e
+
+        def by_branch(b):
+            """Change of h' by the branch's own numbers: E by log tau is x E, P is P - gamma E."""
+            fading = (x[b] * kept[b] * h[b] + (share[b] - gamma[b] * kept[b]) * moved)[None]
+            along = along_gamma[b] * (mean[b] * moved)[None] + along_tau[b] * fading
+            return jnp.concatenate([none_of_columns, along])
+
+        pushed = barrier(
+            [kept[b][None] * dh[b] - share[b][None] * de + by_branch(b) for b in branches]
+        )
+        d_new, all_pushed = jnp.concatenate([columns, none_along]), added(pushed)
+        d_force = A[None] * d_new + all_pushed
+        if unilateral:
+            d_new = barrier(jnp.where(left[None], -all_pushed / A[None], d_new))
+            d_force = jnp.where(left[None], 0, A[None] * d_new + all_pushed)
+        dh = tuple(pushed[b] + share[b][None] * d_new for b in branches)
+        h = tuple(kept[b] * h[b] + share[b] * moved for b in branches)
+        return (h, new, dh, d_new), (force, new, d_force, d_new if surface else None)
+
+    zero = jnp.zeros_like(elastic[0])
+    none = jnp.concatenate([none_of_columns, none_along])
+    start = (zero,) * gamma.shape[0], zero, (none,) * gamma.shape[0], none
+    return jax.lax.scan(step, start, (x, lost, elastic, columns))[1]
+
+
+def _lanes_last(loop):
+    """A loop over samples as one kernel on a CPU, also of many lanes (`vmap`), its last axis.
+
+    What one step reads of all lanes lies together then, and is computed several at a time.
+    """
+    kernel = fuse(loop, streams=True)
+
+    @custom_vmap
+    def call(*arrays):
+        return kernel(*arrays)
+
+    @call.def_vmap
+    def _(count, has_lanes, *arrays):
+        def last(v, own):
+            return jnp.moveaxis(v, 0, -1) if own else jnp.repeat(v[..., None], count, axis=-1)
+
+        found = call(*map(last, arrays, has_lanes))
+        lanes_first = jax.tree.map(lambda v: jnp.moveaxis(v, -1, 0), found)
+        return lanes_first, jax.tree.map(lambda _: True, found)
+
+    return call
+
+
+def _differentiable(loop):
+    """The loop in lanes; its derivatives are those of the loop as it stands, in both modes."""
+    in_lanes = jax.custom_jvp(_lanes_last(loop))
+
+    @in_lanes.defjvp
+    def _(primals, tangents):
+        return in_lanes(*primals), jax.jvp(loop, primals, tangents)[1]
+
+    return in_lanes
+
+
+_filter = _differentiable(_loop)
+_bonded_filter = _differentiable(_bonded_loop)

@@ -1,0 +1,279 @@
+"""A force that relaxes: closed forms, an ODE, laws of relaxation, energy, derivatives, lift-off."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import maxwell
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from late import late
+from scipy.special import exp1
+
+from jaxtrachea.mechanics.relaxation import (
+    Branches,
+    _fading,
+    _in_parallel,
+    relax,
+    relax_with_derivatives,
+)
+from jaxtrachea.mechanics.relaxation_laws import LAWS, Span, branches
+
+TWO = np.array([0.9, 0.5]), np.array([0.36, 4.3])
+#: Load, hold, unload until the tool is off, wait, and load again.
+JOURNEY = np.array([0.0, 1, 6, 7, 9, 10]), np.array([0.0, 4, 4, -0.5, -0.5, 3])
+
+
+def two(dtype="float64") -> Branches:
+    return Branches(*(jnp.asarray(v, dtype) for v in TWO))
+
+
+def journey(count=170):
+    """Times without a common step, and the elastic force of the journey."""
+    rng = np.random.default_rng(3)
+    t = np.sort(np.r_[JOURNEY[0], rng.uniform(0, 10, count)])
+    return jnp.asarray(t), jnp.asarray(np.interp(t, *JOURNEY))
+
+
+@functools.partial(jax.jit, static_argnames="unilateral")
+def run(time, elastic, gamma, tau, unilateral=True):
+    return relax(time, elastic, Branches(gamma, tau), unilateral)
+
+
+def ramp_and_hold(t, top, until, gamma, tau):
+    """Force of an elastic force that rises evenly to `top` at the time `until`."""
+    risen, rate = np.minimum(t, until), top / until
+    force = rate * risen
+    for g, s in zip(gamma, tau, strict=True):
+        force = force + rate * g * s * (np.exp(-(t - risen) / s) - np.exp(-t / s))
+    return force
+
+
+@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
+def test_ramp_and_hold_is_the_closed_form_at_any_samples(dtype):
+    rng = np.random.default_rng(0)
+    t = np.sort(np.r_[0, 2.0, rng.uniform(0, 12, 97), 12]).astype(dtype)
+    elastic = np.minimum(t, 2) * np.asarray(0.25, dtype)
+    most = {"float64": 1e-12, "float32": 1e-6}[dtype]
+    exact = ramp_and_hold(t.astype(float), 0.5, 2.0, *TWO)
+    for unilateral in (True, False):
+        found = run(t, elastic, *two(dtype), unilateral=unilateral)
+        assert found.force.dtype == dtype
+        assert np.abs(found.force - exact).max() < most * exact.max()
+        np.testing.assert_array_equal(found.elastic, elastic)
+
+
+def test_a_sinus_stores_and_loses_as_its_moduli_say():
+    """Of second order in the step, 1e-3 at 64 samples a period; bonded, once it is steady."""
+    omega, errors = 2.0, []
+    iw = 1j * omega * TWO[1]
+    exact = 1 + np.sum(TWO[0] * iw / (1 + iw))
+    for count in (64, 128, 256):
+        t = np.arange(40 * count + 1) * (2 * np.pi / omega / count)
+        force = np.asarray(run(t, np.sin(omega * t), *two(), unilateral=False).force)[-count:]
+        modulus = 2 / count * np.sum(force * np.exp(-1j * (omega * t[-count:] - np.pi / 2)))
+        errors.append(abs(modulus - exact) / abs(exact))
+    assert errors[0] < 1e-3
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 2, atol=0.05)
+
+
+def test_lift_off_and_recovery_are_those_of_the_differential_equation():
+    """While the tool is off the surface creeps and meets it again: of second order in the step."""
+    errors = []
+    for count in (200, 400, 800):
+        t = np.linspace(0, 10, count + 1)
+        force, elastic = maxwell.force_in_time(t, JOURNEY, *TWO)
+        found = run(t, np.interp(t, *JOURNEY), *two())
+        assert np.all((np.asarray(found.force) == 0) == (force <= 1e-12))
+        for one, other in zip(found, (force, elastic), strict=True):
+            errors.append(np.abs(np.asarray(one) - other).max() / force.max())
+    assert 0.05 * count < np.sum(force == 0) < 0.3 * count
+    assert max(errors[-2:]) < 2e-5  # the step in which the tool leaves or lands is not resolved
+    assert min(errors[0] / errors[4], errors[1] / errors[5]) > 10
+
+
+def test_a_branch_that_is_fast_leaves_the_elastic_force_and_a_slow_one_multiplies_it():
+    t, elastic = journey()
+    for tau in (1e-300, 1e-12):
+        found = run(t, elastic, *Branches(jnp.asarray([0.9]), jnp.asarray([tau])))
+        np.testing.assert_allclose(found.force, jnp.maximum(elastic, 0), rtol=0, atol=1e-9)
+    for tau in (1e12, 1e300, np.inf):
+        found = run(t, elastic, *Branches(jnp.asarray([0.9]), jnp.asarray([tau])))
+        np.testing.assert_allclose(found.force, 1.9 * jnp.maximum(elastic, 0), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("tau", [1e-300, 1e-30, 1e-3, 1.0, 1e30, 1e300])
+def test_any_step_and_any_time_is_finite_with_its_derivatives(tau):
+    t = jnp.asarray([0, 0, 1e-300, 1e-9, 1, 1, 3, 1e9, 1e300])
+    elastic = jnp.asarray([0, 1.0, 2, 3, 3, 1, -4, 2, 1])
+
+    def loss(t, elastic, gamma, log_tau):
+        found = relax(t, elastic, Branches(gamma, jnp.exp(log_tau)))
+        return jnp.sum(found.force + found.elastic)
+
+    given = t, elastic, jnp.asarray([0.9, 0.3]), jnp.log(jnp.asarray([tau, tau]))
+    value, slopes = jax.jit(jax.value_and_grad(loss, argnums=(1, 2, 3)))(*given)
+    assert all(np.isfinite(v).all() for v in (value, *slopes))
+
+
+def test_samples_at_one_time_and_padding_change_nothing():
+    t, elastic = journey()
+    plain = run(t, elastic, *two())
+    twice = run(jnp.repeat(t, 2), jnp.repeat(elastic, 2), *two())
+    np.testing.assert_allclose(twice.force[::2], plain.force, rtol=0, atol=1e-14)
+    longer = run(jnp.append(t, t[-1]), jnp.append(elastic, 7.0), *two())
+    np.testing.assert_array_equal(longer.force[:-1], plain.force)
+    jump = 1 + TWO[0].sum()
+    assert float(longer.force[-1] - plain.force[-1]) == pytest.approx(jump * (7 - elastic[-1]))
+
+
+def test_records_a_thousand_times_as_slow_have_the_same_forces():
+    t, elastic = journey()
+    plain = run(t, elastic, *two())
+    for factor in (1e-3, 1e3):
+        found = run(t * factor, elastic, two().gamma, two().tau * factor)
+        np.testing.assert_allclose(found.force, plain.force, rtol=0, atol=1e-12)
+
+
+def test_a_bonded_contact_is_linear_and_the_same_in_parallel():
+    t, elastic = journey()
+    found = run(t, elastic, *two(), unilateral=False)
+    x, lost = _fading(t, two())
+    np.testing.assert_allclose(
+        _in_parallel(x, lost, elastic, two().gamma), found.force, rtol=0, atol=1e-14
+    )
+    assert found.force.min() < -0.5
+    vectors = jnp.stack([elastic, 2 * elastic, -elastic], axis=-1)
+    together = run(t, vectors, *two(), unilateral=False)
+    expected = found.force[:, None] * jnp.asarray([[1.0, 2, -1]])
+    np.testing.assert_allclose(together.force, expected, rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match="unilateral=False"):
+        run(t, vectors, *two())
+
+
+LANES = 5
+
+
+def lanes():
+    """Different journeys side by side."""
+    rng = np.random.default_rng(5)
+    t = np.sort(rng.uniform(0, 10, (LANES, 60)), axis=1)
+    elastic = np.stack([np.interp(v, *JOURNEY) for v in t]) * rng.uniform(0.5, 2, (LANES, 1))
+    gamma, tau = rng.uniform(0.2, 1, (LANES, 2)), 10 ** rng.uniform(-1, 1, (LANES, 2))
+    return [jnp.asarray(v) for v in (t, elastic, gamma, tau)]
+
+
+@pytest.mark.parametrize("unilateral", [True, False])
+def test_many_lanes_are_each_as_if_alone(unilateral):
+    def one(t, elastic, gamma, tau):
+        return relax(t, elastic, Branches(gamma, tau), unilateral)
+
+    together = jax.jit(jax.vmap(one))(*lanes())
+    twice = jax.jit(jax.vmap(jax.vmap(one), in_axes=(0, 0, 0, None)))(
+        *(jnp.stack([v, v]) for v in lanes()[:3]), lanes()[3]
+    )
+    for i, given in enumerate(zip(*lanes(), strict=True)):
+        alone = one(*given)
+        for side in (0, 1):
+            np.testing.assert_allclose(together[side][i], alone[side], rtol=0, atol=1e-14)
+            np.testing.assert_allclose(twice[side][1, i], alone[side], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("unilateral", [True, False])
+def test_derivatives_in_both_modes_are_those_of_differences(unilateral):
+    t, elastic = (v[1:] for v in journey(40))  # before the first sample there is a corner
+
+    def of(elastic, log_gamma, log_tau):
+        given = Branches(jnp.exp(log_gamma), jnp.exp(log_tau))
+        return tuple(relax(t, jnp.asarray(elastic), given, unilateral))
+
+    check_grads(of, (elastic, *map(jnp.log, two())), order=1, rtol=1e-6, atol=1e-6, eps=1e-6)
+    if unilateral:
+        assert np.sum(np.asarray(of(elastic, *map(jnp.log, two()))[0]) == 0) > 3
+
+
+@pytest.mark.parametrize("unilateral", [True, False])
+def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilateral):
+    t, elastic, *_ = lanes()
+
+    def of(t, e, scale, log_gamma, log_tau):
+        moved = scale[0] * e + scale[1] * e * e * e
+        return tuple(relax(t, moved, Branches(jnp.exp(log_gamma), jnp.exp(log_tau)), unilateral))
+
+    def beside(t, e, scale, log_gamma, log_tau):
+        moved = scale[0] * e + scale[1] * e * e * e
+        given = Branches(jnp.exp(log_gamma), jnp.exp(log_tau))
+        columns = jnp.stack([e, e * e * e])
+        return relax_with_derivatives(t, moved, columns, given, unilateral, surface=True)
+
+    given = jnp.asarray([1.0, 0.05]), *map(jnp.log, two())
+    axes = (0, 0, None, None, None)
+    value, by = jax.jit(jax.vmap(beside, axes))(t, elastic, *given)
+    expected = jax.jit(jax.vmap(jax.jacfwd(of, argnums=(2, 3, 4)), axes))(t, elastic, *given)
+    plain = jax.vmap(of, axes)(t, elastic, *given)
+    for i in (0, 1):
+        np.testing.assert_allclose(value[i], plain[i], rtol=0, atol=1e-13)
+        rows = jnp.moveaxis(jnp.concatenate(expected[i], axis=-1), -1, 1)
+        np.testing.assert_allclose(by[i], rows, rtol=0, atol=1e-11)
+    assert relax_with_derivatives(t[0], elastic[0], elastic[:1], two())[1].elastic is None
+
+
+def test_directions_chain_a_law_of_few_numbers_to_its_branches():
+    t, elastic = journey(60)
+    span, given = Span(0.05, 10.0), jnp.asarray([0.7, 0.2])
+
+    def of(given):
+        return branches("power", dict(zip(("gamma", "beta"), given, strict=True)), span)
+
+    made, along = of(given), jax.tree.map(jnp.transpose, jax.jacfwd(of)(given))
+    _, by = relax_with_derivatives(t, elastic, elastic[None], made, along=along)
+    expected = jax.jacfwd(lambda v: relax(t, elastic, of(v)).force)(given)
+    np.testing.assert_allclose(by.force[1:], expected.T, rtol=0, atol=1e-12)
+
+
+def reduced(t, made):
+    """The reduced relaxation function, without what lasts."""
+    return np.exp(-t[:, None] / np.asarray(made.tau)) @ np.asarray(made.gamma)
+
+
+@pytest.mark.parametrize("beta", [0.05, 0.1, 0.2, 0.35, 0.4])
+def test_the_power_law_is_one_from_the_shortest_step_to_the_longest_record(beta):
+    for span in (Span(1e-3, 1e3), Span(0.02, 30.0), Span(0.5, 0.5)):
+        made = branches("power", {"gamma": jnp.asarray(0.8), "beta": jnp.asarray(beta)}, span)
+        t = np.geomspace(span.shortest, span.longest, 400)
+        np.testing.assert_allclose(reduced(t, made), 0.8 * t**-beta, rtol=1e-3)
+
+
+@pytest.mark.parametrize("beta", [0.1, 0.4])
+def test_a_ramp_of_the_power_law_counts_what_relaxes_within_a_step(beta):
+    """The closed form t^(1 - beta) / (1 - beta); without the fast rest it is short by up to 1 %."""
+    t = jnp.linspace(0, 10, 201)
+    made = branches("power", {"gamma": jnp.asarray(1.0), "beta": jnp.asarray(beta)}, Span(0.05, 10))
+    exact = np.asarray(t) + np.asarray(t) ** (1 - beta) / (1 - beta)
+    np.testing.assert_allclose(relax(t, t, made).force[1:], exact[1:], rtol=1.5e-3)
+
+
+@pytest.mark.parametrize("apart", [1.01, 100.0, 1e4])
+def test_the_box_of_fung_is_the_difference_of_exponential_integrals(apart):
+    values = {"C": 0.2, "tau_1": 0.01, "tau_2": 0.01 * apart}
+    made = branches("fung", {k: jnp.asarray(v) for k, v in values.items()}, Span(0.1, 1))
+    t = np.geomspace(1e-3, 1e3, 400)
+    exact = 0.2 * (exp1(t / values["tau_2"]) - exp1(t / values["tau_1"]))
+    assert np.abs(reduced(t, made) - exact).max() < 1e-4 * 0.2 * np.log(apart)
+
+
+def test_prony_keeps_its_branches_in_order():
+    values = {"gamma_1": 0.5, "gamma_2": 0.4, "gamma_3": 0.3, "tau_1": 0.2,
+              "tau_ratio_2": 3.0, "tau_ratio_3": 10.0}  # fmt: skip
+    made = branches("prony-3", {k: jnp.asarray(v) for k, v in values.items()}, Span(0.1, 1))
+    np.testing.assert_allclose(made.gamma, [0.5, 0.4, 0.3])
+    np.testing.assert_allclose(made.tau, [0.2, 0.6, 6.0])
+    assert LAWS["prony-1"].names == ("gamma_1", "tau_1")
+
+
+def test_a_law_names_what_it_lacks():
+    with pytest.raises(ValueError, match="'fung' needs tau_1, tau_2"):
+        branches("fung", {"C": jnp.asarray(1.0)}, Span(0.1, 1))
+    with pytest.raises(ValueError, match="shortest <= longest"):
+        branches("prony-1", {"gamma_1": jnp.asarray(1.0), "tau_1": jnp.asarray(1.0)}, Span(2, 1))
