@@ -107,7 +107,8 @@ def force_jacobian(
 def _seen(model: FitModel, free, trial: Lane, tube: Geometry) -> list[Array]:
     """What the model shows of every kind of observation of a trial, in the order of the row.
 
-    Samples that nothing observes are not pressed: the tool stays at rest.
+    Samples that nothing observes are not pressed, but where the force relaxes: the tool stays at
+    rest.
     """
     kinds = forces(trial) + markers(trial)
     looked = jnp.any(
@@ -115,7 +116,11 @@ def _seen(model: FitModel, free, trial: Lane, tube: Geometry) -> list[Array]:
     )
     onset = values_of(model, free, trial.value)["onset"]
     D = jnp.where(looked, trial.displacement, onset)
-    motion = Motion(trial.s_c, D, blend=trial.blend, phi_c=trial.phi_c, direction=trial.direction)
+    D = D if trial.time is None else trial.displacement  # what follows remembers it
+    motion = Motion(
+        trial.s_c, D, blend=trial.blend, phi_c=trial.phi_c, direction=trial.direction,
+        time=trial.time,
+    )  # fmt: skip
     found = answer(model, free, trial.value, motion, tube)
     return [getattr(found, kind.name) for kind in kinds]
 

@@ -16,6 +16,7 @@ from jaxtrachea.fitting import forward_residual
 from jaxtrachea.fitting.lane import Lane, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import SKELETON
+from jaxtrachea.fitting.relaxing import numbers, relaxed_press, relaxed_value
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import coefficient
 from jaxtrachea.mechanics.levels.level import Closed, Motion
@@ -56,6 +57,7 @@ class Inputs(NamedTuple):
         force_offset: N; (T,).
         force_slope: of the force without contact, N/mm; (T,). None where the model has no such
             line.
+        relaxation: numbers of the law by which the force relaxes; (T, K). None: it does not.
     """
 
     compliance: Float[Array, " T"]
@@ -63,6 +65,7 @@ class Inputs(NamedTuple):
     contact: Contact
     force_offset: Float[Array, " T"]
     force_slope: Float[Array, " T"] | None = None
+    relaxation: Float[Array, "T K"] | None = None
 
 
 def inputs(
@@ -88,7 +91,10 @@ def inputs(
         return _at_contact(model, free, value, s_c, tube)
 
     local = jax.vmap(at)(free, lane.value, lane.s_c)
-    return Inputs(_felt(model, skeleton), skeleton.joints, *local)
+    relaxation = None
+    if model.relaxes:
+        relaxation = jax.vmap(lambda *v: numbers(model, values_of(model, *v)))(free, lane.value)
+    return Inputs(_felt(model, skeleton), skeleton.joints, *local, relaxation)
 
 
 def residual(
@@ -126,12 +132,15 @@ def residual_value(
         at = _at_contact(model, free, trial.value, trial.s_c, tube, trial.blend)
         felt = _felt(model, skeleton)
         solved = _closed(model).respond(trial.displacement, felt, at.contact)
-        load = solved.force if solved.load is None else solved.load
+        force, load = solved.force, solved.force if solved.load is None else solved.load
+        if model.relaxes:
+            values = values_of(model, free, trial.value)
+            force, load = relaxed_value(model, values, trial.time, force, load)
         joints = None if skeleton.joints is None else _times(load, skeleton.joints)
         without = at.force_offset
         if at.force_slope is not None:
             without = without + at.force_slope * trial.displacement
-        return _whitened(solved.force + without, joints, trial)
+        return _whitened(force + without, joints, trial)
 
     return jax.vmap(one)(free, skeleton, of_press(lane))
 
@@ -186,7 +195,7 @@ def _skeleton(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleto
     """What moves under a unit force in every trial."""
 
     def at(free, value, s_c):
-        material = model.level.material(values_of(model, free, value))
+        material = _closed(model).material(values_of(model, free, value))
         return Skeleton(*_closed(model).skeleton(tube, material, s_c, joints=places.marked))
 
     if model.options.coupling == "total" and not places.marked:
@@ -226,7 +235,7 @@ class _Local(NamedTuple):
 
 def _at_contact(model: FitModel, free, value, s_c, tube: Geometry, blend=None) -> _Local:
     values = values_of(model, free, value)
-    material = model.level.material(values)
+    material = _closed(model).material(values)
     contact = _closed(model).contact(tube, material, s_c, values["onset"], blend)
     return _Local(contact, values["force_offset"], values.get("force_slope"))
 
@@ -351,6 +360,8 @@ def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, tria
     """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
     motion = Motion(trial.s_c, trial.displacement, blend=trial.blend)
     pressed = _press(model, tube, free, trial.value, skeleton, by_beam, motion)
+    if model.relaxes:
+        pressed = relaxed_press(model, free, trial.value, trial.time, pressed)
     joints, d_joints = None, None
     if skeleton.joints is not None and pressed.d_joints is not None:
         joints = _times(pressed.load, skeleton.joints)
@@ -376,6 +387,7 @@ def force_jacobian(
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
     phi_c: Float[Array, ""] | None = None,
+    time: Float[Array, " N"] | None = None,
 ) -> Float[Array, "Jf m"]:
     """Derivative of the force at the load cell by the free columns, of a press without data.
 
@@ -389,9 +401,10 @@ def force_jacobian(
         displacement: of the tool, mm.
         blend: rounded corner at the onset, mm, see `Lane`.
         phi_c: contact angle, rad, the tool along the normal; None: on the midline.
+        time: of every displacement, s, where the force relaxes.
     """
     tube = _tube(model, None, free.dtype)
-    motion = Motion(s_c, displacement, blend=blend)
+    motion = Motion(s_c, displacement, blend=blend, time=time)
     if model.level.closed is None:
         if phi_c is not None:
             along = jnp.asarray([1.0, 0.0], free.dtype)
@@ -401,6 +414,9 @@ def force_jacobian(
     of_lane = _skeleton_and_derivative(model, free[None], places, tube)
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
     pressed = _press(model, tube, free, value, skeleton, by_beam, motion)
+    if model.relaxes:
+        assert time is not None
+        pressed = relaxed_press(model, free, value, time, pressed)
     return pressed.d_force + pressed.d_offset
 
 

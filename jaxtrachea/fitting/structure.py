@@ -30,6 +30,7 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.levels.level import Closed
 from jaxtrachea.mechanics.press import Contact
+from jaxtrachea.mechanics.relaxation_laws import LAWS
 from jaxtrachea.mechanics.softening import Softening
 
 #: Points of the parameter box, and half its width in decades.
@@ -285,6 +286,8 @@ def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
         rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(k_1), *more]
         rows += [] if x.force_slope is None else [x.force_slope]
         rows = jnp.stack([*rows, x.contact.onset, x.force_offset], axis=1)
+        if x.relaxation is not None:
+            rows = jnp.concatenate([rows, jnp.log(x.relaxation)], axis=1)
         if x.joints is None:
             return rows
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(x.joints)), axis=1, keepdims=True)
@@ -334,12 +337,19 @@ def _generic(
 def _curve_sees(study: Study) -> Float[np.ndarray, "r n"]:
     """Combinations of (log c, log k_1, k_3, ..., e_1, e_2, onset, offset) one curve tells; rows.
 
-    Before the onset the slope of the force without contact, where the model has one.
+    Before the onset the slope of the force without contact, where the model has one. A record at
+    generic times, with a hold or two speeds, tells every number of its relaxation.
     """
     line = any(p.name == "force_slope" for p in study.parameters)
     closed = study.model.level.closed
     assert closed is not None
-    return _generic(closed, tuple(_higher(study).items()), line)
+    V = _generic(closed, tuple(_higher(study).items()), line)
+    if not study.model.relaxes:
+        return V
+    count = len(LAWS[study.model.options.branches].names)
+    return np.block(
+        [[V, np.zeros((len(V), count))], [np.zeros((count, V.shape[1])), np.eye(count)]]
+    )
 
 
 def _higher(study: Study) -> dict[str, bool]:
@@ -391,6 +401,8 @@ def without_curves(study: Study) -> Study:
     """The study with curves of one sample: what the inputs need and no more."""
     lanes = study.lanes
     one = {name: getattr(lanes, name)[:, :, :1] for name in ("displacement", "force", "precision")}
+    if lanes.time is not None:
+        one |= {"time": lanes.time[:, :, :1], "rising": lanes.rising[:, :, :1]}
     if lanes.joints is not None:
         one |= {name: getattr(lanes, name)[:, :, :1] for name in ("joints", "joint_precision")}
     return dataclasses.replace(study, lanes=lanes._replace(**one))

@@ -19,7 +19,9 @@ from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
 from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
+from jaxtrachea.mechanics.levels.relaxing import ANY_SPAN
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.relaxation_laws import Span
 from jaxtrachea.results.arrays import PLACES, result_of
 from jaxtrachea.results.hdf5 import SCHEMA, VERSION
 from jaxtrachea.results.store import BY_SAMPLE, GEOMETRY, read_data, read_json
@@ -190,6 +192,7 @@ def _study(file: Any, model: dict[str, Any], place: _Places, curves: tuple[Curve
             loss=model["loss"],
             loss_scale=float(model["loss_scale"]),
             common=model["common"],
+            span=Span(*model["span"]) if "span" in model else ANY_SPAN,
         ),
         parameters=parameters,
         lanes=_lanes(file["data"], place, arrays),
@@ -221,6 +224,8 @@ def _lanes(data: Any, place: _Places, arrays: dict[str, Any]) -> Lane:
             continue
         values = place.spread(numeric(data, name))
         observed[name] = values if name == "force" else np.where(weight > 0, values, 0.0)
+    if "time" in arrays:  # padding repeats the last
+        arrays["time"] = np.maximum.accumulate(arrays["time"], axis=-1)
     every: dict[str, Any] = {"blend": None} | arrays | observed
     return Lane(**every)
 

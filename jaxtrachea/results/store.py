@@ -23,7 +23,7 @@ from jaxtrachea.trachea.geometry import Geometry
 GEOMETRY = tuple(f.name for f in dataclasses.fields(Geometry))
 #: Arrays of the lanes that follow from the data, and those that have a row for each sample.
 OBSERVED = ("displacement", *(name for name, _ in FORCES + MARKERS))
-BY_SAMPLE = (*(name for _, name in FORCES + MARKERS), "shares_plain")
+BY_SAMPLE = (*(name for _, name in FORCES + MARKERS), "shares_plain", "time", "rising")
 #: Pieces of a column that are tried, rows of each, and the part that gzip must leave at most.
 PIECES, ROWS, WORTH = 16, 1024, 0.7
 
@@ -53,6 +53,7 @@ def write(
             "loss": study.model.loss,
             "loss_scale": study.model.loss_scale,
             "common": study.model.common,
+            "span": study.model.span,
             "noise_given": study.noise_given,
             "balance": study.balance,
             "marker_noise": study.marker_noise,

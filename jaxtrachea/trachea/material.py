@@ -16,10 +16,10 @@ from jaxtrachea._arguments import check_word, real
 
 Scope = Literal["shared", "specimen", "trial"]
 Scale = Literal["log", "linear"]
-Part = Literal["skeleton", "contact", "finite strain", "sections", "press"]
+Part = Literal["skeleton", "contact", "finite strain", "sections", "time", "press"]
 Needs = Literal[
     "", "shear", "two-material", "softening", "axial", "arch", "second plane", "sections",
-    "arch, sections",
+    "arch, sections", "relaxation",
 ]  # fmt: skip
 Each = Literal["", "span", "ring"]
 
@@ -71,8 +71,9 @@ class Declaration:
         description: what the user reads in tables.
         part: `skeleton` (it changes the compliance under the contact), `contact` (the local law),
             `finite strain` (how the skeleton leaves that compliance in deep presses), `sections`
-            (of a skeleton of deforming cross-sections, in `SectionMaterial`) or `press` (of a
-            single press: no property of the specimen, not in `Material`).
+            (of a skeleton of deforming cross-sections, in `SectionMaterial`), `time` (how the force
+            relaxes, beside a material of any kind) or `press` (of a single press: no property of
+            the specimen, not in `Material`).
         symbol: in the paper.
         needs: option or effect that reads it; "" where every press does. A fit has it in its model
             where `mechanics.press.Options` has that option.
@@ -268,14 +269,48 @@ _OF_THE_PRESS = (
         fit=Fitted(0.0, -1e4, 1e4, "linear", 0.01, "trial", fixed=True, auto=True, if_named=True),
     ),
 )  # fmt: skip
+
+
+def _strength(name: str, what: str) -> Declaration:
+    return Declaration(
+        name, "1", "dimensionless", what, part="time", needs="relaxation",
+        fit=Fitted(0.5, 1e-4, 1e3),
+    )  # fmt: skip
+
+
+def _duration(name: str, what: str, value: float) -> Declaration:
+    return Declaration(
+        name, "s", "time", what, part="time", needs="relaxation", fit=Fitted(value, 1e-9, 1e9)
+    )
+
+
+def _ratio(name: str, what: str, fit: Fitted) -> Declaration:
+    return Declaration(name, "1", "dimensionless", what, part="time", needs="relaxation", fit=fit)
+
+
+#: How a force relaxes: numbers of the laws of `mechanics.relaxation_laws`.
+_OF_TIME = (
+    *(_strength(f"gamma_{b}", f"strength of branch {b} over what lasts") for b in range(1, 5)),
+    _strength("gamma", "strength after 1 s over what lasts"),
+    _strength("C", "strength a natural logarithm of time"),
+    _duration("tau_1", "shortest relaxation time", 1.0),
+    *(
+        _ratio(f"tau_ratio_{b}", f"relaxation time {b} over that before", Fitted(10.0, 2.0, 1e9))
+        for b in range(2, 5)
+    ),
+    _duration("tau_2", "longest relaxation time", 100.0),
+    _ratio("beta", "exponent of the relaxation", Fitted(0.15, 0.05, 0.4)),
+)
 #: Values of a material by name, in the order of every table.
 VALUES: dict[str, Declaration] = {
     field.name: field.metadata["declaration"] for field in dataclasses.fields(Material)
 }
+#: Those of relaxation.
+OF_TIME: dict[str, Declaration] = {p.name: p for p in _OF_TIME}
 #: Those of single presses.
 OF_PRESS: dict[str, Declaration] = {p.name: p for p in _OF_THE_PRESS}
 #: Every parameter of a line of joints, likewise; those of single presses last.
-PARAMETERS: dict[str, Declaration] = VALUES | OF_PRESS
+PARAMETERS: dict[str, Declaration] = VALUES | OF_TIME | OF_PRESS
 #: Values of a skeleton that softens in deep presses.
 DEEP = tuple(name for name, p in VALUES.items() if p.needs == "softening")
 

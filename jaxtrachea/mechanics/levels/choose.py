@@ -1,5 +1,6 @@
 """The two doors: the level that options ask for, and its kind where a material alone is there."""
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Mapping
@@ -8,9 +9,11 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea.mechanics.levels.level import Level
 from jaxtrachea.mechanics.levels.line import Line
 from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.levels.relaxing import ANY_SPAN, Relaxation
 from jaxtrachea.mechanics.levels.sections import Sections
+from jaxtrachea.mechanics.relaxation_laws import Span
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.trachea.material import Declaration, Material
+from jaxtrachea.trachea.material import OF_TIME, Declaration, Material
 
 #: The level of each word of `Options.skeleton`.
 LEVELS = {"linear": Line, "softening": Line, "sections": Sections}
@@ -18,14 +21,21 @@ LEVELS = {"linear": Line, "softening": Line, "sections": Sections}
 AnyMaterial = Material | SectionMaterial
 #: The parameters of all levels, by name.
 DECLARED: Mapping[str, Declaration] = functools.reduce(
-    operator.or_, (kind.declares for kind in LEVELS.values())
+    operator.or_, (*(kind.declares for kind in LEVELS.values()), OF_TIME)
 )
 
 
 @functools.lru_cache(maxsize=256)
-def level_of(options: Options) -> Level:
-    """The level that options ask for; equal where they are."""
-    return LEVELS[options.skeleton](options)
+def level_of(options: Options, span: Span = ANY_SPAN) -> Level:
+    """The level that options ask for; equal where they are.
+
+    Args:
+        options: -
+        span: times of the records, s; read where the force relaxes.
+    """
+    elastic = dataclasses.replace(options, relaxation="off", branches=Options.branches)
+    level = LEVELS[options.skeleton](elastic)
+    return level if options.relaxation == "off" else Relaxation(level, options, span)
 
 
 def level_type(material: AnyMaterial) -> type[Level]:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Contact
+from jaxtrachea.mechanics.relaxation import Branches
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Declaration
 
@@ -27,6 +28,7 @@ class Motion(NamedTuple):
         blend: rounded corner of a curve whose onset was fitted, mm; None: that of the options.
         phi_c: contact angle, rad; None, as `direction`: on the midline, along the normal.
         direction: of the tool, along the inward normal and the circumference.
+        time: of every displacement, s, never falling; None: the level has no time.
     """
 
     s_c: Float[Array, ""]
@@ -35,6 +37,7 @@ class Motion(NamedTuple):
     blend: Float[Array, ""] | None = None
     phi_c: Float[Array, ""] | None = None
     direction: Float[Array, "2"] | None = None
+    time: Float[Array, " N"] | None = None
 
 
 class Response(NamedTuple):
@@ -93,6 +96,8 @@ class Record(Protocol):
     def direction(self) -> Any: ...  # noqa: D102
     @property
     def displacement(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def time(self) -> np.ndarray | None: ...  # noqa: D102
 
 
 @runtime_checkable
@@ -102,6 +107,10 @@ class Closed(Protocol):
     The skeleton enters by its compliance at the contact alone, so that a fit differentiates it once
     for each position, and not for each sample.
     """
+
+    def material(self, values: Mapping[str, Array]) -> Any:
+        """Values by name as its record."""
+        ...
 
     def skeleton(
         self, tube: Geometry, material: Any, s_c: Float[Array, "*m"], *, joints: bool
@@ -180,6 +189,10 @@ class Level(abc.ABC):
     def parts(self) -> tuple[str, ...]:
         """What of it the options chose, in words."""
         return ()
+
+    def branches(self, values: Mapping[str, Array]) -> Branches | None:
+        """How its force relaxes; None: it does not."""
+        return None
 
     def tested_angle(self, half_angle: float) -> float:
         """Angle from the midline to which it was tested, rad; 0: it presses there alone."""

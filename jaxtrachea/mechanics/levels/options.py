@@ -5,6 +5,7 @@ from typing import Literal
 
 from jaxtrachea._arguments import check_record, check_word
 from jaxtrachea.mechanics import beam as _beam
+from jaxtrachea.mechanics.relaxation_laws import Word
 
 #: Words of the skeletons; `levels.choose` has the level of each.
 Skeleton = Literal["linear", "softening", "sections"]
@@ -36,6 +37,9 @@ class Options:
             (needs `Material.e_1` and `e_2`, and `series`); or `sections`, in fits: deforming
             cross-sections, anywhere on the rings and at finite strain (`bonded`; no other option
             but `half_width` applies). `press_sections` presses that one.
+        relaxation: `off` (elastic), or in fits `uniform`: all parts relax alike, and the force is a
+            filter of the elastic one by the time (`mechanics.relaxation`).
+        branches: the law of the relaxation, see `mechanics.relaxation_laws`.
     """
 
     coupling: Literal["series", "total"] = "series"
@@ -48,6 +52,8 @@ class Options:
     transition: float | None = None
     half_width: float = 0.0
     skeleton: Skeleton = "linear"
+    relaxation: Literal["off", "uniform"] = "off"
+    branches: Word = "prony-2"
 
     def __post_init__(self):
         """Refuse words and numbers that no model has, and options that exclude each other.
@@ -104,4 +110,9 @@ def check_line(options: Options, what: str) -> None:
         raise ValueError(
             f"{what} presses a line of joints, not skeleton={options.skeleton!r}; "
             "use press_sections"
+        )
+    if options.relaxation != "off":
+        raise ValueError(
+            f"{what} is elastic, not relaxation={options.relaxation!r}; use relaxation.relax on "
+            "its force, by the time"
         )
