@@ -13,8 +13,8 @@ from scipy.special import exp1
 
 from jaxtrachea.mechanics.relaxation import (
     Branches,
-    _fading,
     _in_parallel,
+    fading,
     relax,
     relax_with_derivatives,
 )
@@ -139,7 +139,7 @@ def test_records_a_thousand_times_as_slow_have_the_same_forces():
 def test_a_bonded_contact_is_linear_and_the_same_in_parallel():
     t, elastic = journey()
     found = run(t, elastic, *two(), unilateral=False)
-    x, lost = _fading(t, two())
+    x, lost = fading(t, two())
     np.testing.assert_allclose(
         _in_parallel(x, lost, elastic, two().gamma), found.force, rtol=0, atol=1e-14
     )

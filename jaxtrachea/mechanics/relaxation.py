@@ -100,7 +100,7 @@ def relax(
         if unilateral:
             raise ValueError("a vector has no sign to let go at; expected unilateral=False")
         return jax.vmap(lambda e: relax(time, e, branches, False), -1, -1)(elastic)
-    x, lost = _fading(time, branches)
+    x, lost = fading(time, branches)
     if unilateral:
         return Relaxed(*_filter(x, lost, elastic, branches.gamma))
 
@@ -138,17 +138,15 @@ def relax_with_derivatives(
     Returns:
         The force, and its derivatives by the C columns and along the K directions.
     """
-    if along is None:
-        gamma, tau = jnp.diag(branches.gamma), jnp.diag(branches.tau)
-        zero = jnp.zeros_like(gamma)
-        along = Branches(jnp.concatenate([gamma, zero]), jnp.concatenate([zero, tau]))
-    # A branch that never relaxes has no change of log tau.
-    log_tau = jnp.where(along.tau == 0, 0, along.tau / branches.tau[None])
-    x, lost = _fading(time, branches)
+    if along is not None:
+        # A branch that never relaxes has no change of log tau.
+        log_tau = jnp.where(along.tau == 0, 0, along.tau / branches.tau[None])
+        along = Branches(along.gamma.T, log_tau.T)
+    x, lost = fading(time, branches)
     loop = functools.partial(_loop_with_derivatives, unilateral=unilateral, surface=surface)
     # Samples and branches in front, as the loop reads them.
     force, of_surface, d_force, d_surface = _lanes_last(loop)(
-        x, lost, elastic, columns.T, branches.gamma, along.gamma.T, log_tau.T
+        x, lost, elastic, columns.T, branches.gamma, along
     )
     d_surface = None if d_surface is None else d_surface.T
     return Relaxed(force, of_surface), Derivatives(d_force.T, d_surface)
@@ -157,7 +155,7 @@ def relax_with_derivatives(
 # Steps
 
 
-def _fading(time, branches: Branches):
+def fading(time, branches: Branches):
     """Steps over relaxation times, (N, B), and what they take of a branch: expm1(-x)."""
     dt = jnp.diff(time, prepend=time[:1])
     x = _over(dt[:, None], branches.tau[None])
@@ -180,29 +178,32 @@ def _over_jvp(primals, tangents):
     return x, jnp.where(free, (tangents[0] - x * tangents[1]) / tau, 0)
 
 
-#: Of the numbers of each size: the parts of log 2 (the first with few bits, so that its products
-#: with small integers are exact), the terms of the series, integers of that size, bits of the
-#: mantissa, exponent of 1, and the largest x.
+#: By size of the numbers: the parts of log 2 (the first with few bits, so that its products with
+#: small integers are exact), terms of the series, integers of that size, bits of the mantissa, the
+#: exponent of 1, the largest x.
 _EXPM1 = {
-    8: (6.93147180369123816490e-01, 1.90821492927058770002e-10, 13, jnp.int64, 52, 1023, 700.0),
+    8: (6.93147180369123816490e-01, 1.90821492927058770002e-10, 12, jnp.int64, 52, 1023, 700.0),
     4: (0.693359375, -2.12194440e-4, 7, jnp.int32, 23, 127, 80.0),
 }
 
 
 @jax.custom_jvp
 def _lost(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """`expm1(-x)` for x >= 0 to an ulp or two: of many numbers three times as quick as XLA's.
+    """`expm1(-x)` for x >= 0 to an ulp or two: of many numbers several times as quick as XLA's.
 
-    -x = n log 2 + r; of r its series, times 2^n from the bits.
+    -x = n log 2 + r; of r its series, times 2^n. Added to 1.5 times 2^mantissa, a number is rounded
+    to n and has it in its last bits; those, shifted, are the exponent of 2^n.
     """
     high, low, terms, integer, mantissa, bias, most = _EXPM1[x.dtype.itemsize]
-    y = -jnp.minimum(x, most)
-    n = jnp.round(y * (1 / math.log(2)))
+    y, rounding = -jnp.minimum(x, most), 1.5 * 2.0**mantissa
+    bits = jax.lax.bitcast_convert_type(y * (1 / math.log(2)) + rounding, integer)
+    # Its sign bit is none; without this a compiler takes the rounding off again.
+    n = jax.lax.bitcast_convert_type(bits & jnp.iinfo(integer).max, x.dtype) - rounding
     r = y - n * high - n * low
     series = jnp.full_like(r, 1 / math.factorial(terms))
     for i in range(terms - 1, 0, -1):
         series = series * r + 1 / math.factorial(i)
-    power = jax.lax.bitcast_convert_type((n.astype(integer) + bias) << mantissa, x.dtype)
+    power = jax.lax.bitcast_convert_type((bits + bias) << mantissa, x.dtype)
     return power * (series * r) + (power - 1)
 
 
@@ -218,7 +219,7 @@ def _mean(x, lost):
     return jnp.where(near, 1 - x / 2, -lost / jnp.where(near, 1, x))
 
 
-def _factors(x, lost, gamma):
+def factors(x, lost, gamma):
     """E, (1 - E) / x and P of each branch, as lists: unrolled, it is vectorised over the lanes."""
     count = range(gamma.shape[0])
     mean = [_mean(x[b], lost[b]) for b in count]
@@ -226,21 +227,22 @@ def _factors(x, lost, gamma):
 
 
 def _press(kept, share, h, e, elastic, unilateral: bool):
-    """Force, elastic force of the surface, whether the tool has left, and A, of one step."""
+    """Force, elastic force of the surface, whether the tool has left, A and 1 / A, of one step."""
     A = 1 + added(share)
     B = added(E * h - P * e for E, P, h in zip(kept, share, h, strict=True))
     force = A * elastic + B
     left = force < 0
     if not unilateral:
-        return force, elastic, jnp.zeros_like(left), A
-    return jnp.where(left, 0, force), jnp.where(left, -B / A, elastic), left, A
+        return force, elastic, jnp.zeros_like(left), A, jnp.ones_like(A)
+    per_A = 1 / A
+    return jnp.where(left, 0, force), jnp.where(left, -B * per_A, elastic), left, A, per_A
 
 
 def _loop(x, lost, elastic, gamma, unilateral: bool = True):
     """Force and elastic force of the surface; arrays may have lanes as their last axis.
 
     Args:
-        x: see `_fading`; (N, B, *lanes), as `lost`.
+        x: see `fading`; (N, B, *lanes), as `lost`.
         lost: what a step takes of a branch.
         elastic: (N, *lanes).
         gamma: (B, *lanes).
@@ -250,7 +252,7 @@ def _loop(x, lost, elastic, gamma, unilateral: bool = True):
     def step(state, sample):
         h, e = state
         x, lost, elastic = sample
-        kept, _, share = _factors(x, lost, gamma)
+        kept, _, share = factors(x, lost, gamma)
         force, new, *_ = _press(kept, share, h, e, elastic, unilateral)
         moved = new - e
         h = tuple(E * h + P * moved for E, P, h in zip(kept, share, h, strict=True))
@@ -278,7 +280,7 @@ def _in_parallel(x, lost, elastic, gamma):
 
 
 def _loop_with_derivatives(
-    x, lost, elastic, columns, gamma, along_gamma, along_tau, *, unilateral: bool, surface: bool
+    x, lost, elastic, columns, gamma, along, *, unilateral: bool, surface: bool
 ):
     """`_loop`, and derivatives of its results by C columns and along K directions; lanes as there.
 
@@ -290,8 +292,7 @@ def _loop_with_derivatives(
         elastic: N.
         columns: derivatives of the elastic force; (N, C, *lanes).
         gamma: of the branches.
-        along_gamma: changes of gamma; (B, K, *lanes).
-        along_tau: of log tau; likewise.
+        along: changes of gamma and of log tau, each (B, K, *lanes); None: of their logarithms.
         unilateral: static.
         surface: whether derivatives of the surface's elastic force are asked for (static).
 
@@ -299,21 +300,29 @@ def _loop_with_derivatives(
         Force, elastic force, the derivatives of the one and those of the other or None.
     """
     barrier, branches = jax.lax.optimization_barrier, range(gamma.shape[0])
-    none_of_columns = jnp.zeros_like(columns[0])
-    none_along = jnp.zeros_like(along_gamma[0])
+    zero, none_of_columns = jnp.zeros_like(elastic[0]), jnp.zeros_like(columns[0])
+    if along is None:
+        none_along = jnp.zeros((2 * len(branches), *zero.shape), zero.dtype)
+    else:
+        none_along = jnp.zeros_like(along.gamma[0])
 
     def step(state, sample):
         h, e, dh, de = state
         x, lost, elastic, columns = sample
-        kept, mean, share = barrier(_factors(x, lost, gamma))
-        force, new, left, A = barrier(_press(kept, share, h, e, elastic, unilateral))
+        kept, mean, share = barrier(factors(x, lost, gamma))
+        force, new, left, A, per_A = barrier(_press(kept, share, h, e, elastic, unilateral))
         moved = new - e
 
         def by_branch(b):
             """Change of h' by the branch's own numbers: E by log tau is x E, P is P - gamma E."""
-            fading = (x[b] * kept[b] * h[b] + (share[b] - gamma[b] * kept[b]) * moved)[None]
-            along = along_gamma[b] * (mean[b] * moved)[None] + along_tau[b] * fading
-            return jnp.concatenate([none_of_columns, along])
+            fading = x[b] * kept[b] * h[b] + (share[b] - gamma[b] * kept[b]) * moved
+            if along is None:
+                rows = [zero] * (2 * len(branches))
+                rows[b], rows[len(branches) + b] = share[b] * moved, fading
+                own = jnp.stack(rows)
+            else:
+                own = along.gamma[b] * (mean[b] * moved)[None] + along.tau[b] * fading[None]
+            return jnp.concatenate([none_of_columns, own])
 
         pushed = barrier(
             [kept[b][None] * dh[b] - share[b][None] * de + by_branch(b) for b in branches]
@@ -321,13 +330,12 @@ def _loop_with_derivatives(
         d_new, all_pushed = jnp.concatenate([columns, none_along]), added(pushed)
         d_force = A[None] * d_new + all_pushed
         if unilateral:
-            d_new = barrier(jnp.where(left[None], -all_pushed / A[None], d_new))
+            d_new = barrier(jnp.where(left[None], -all_pushed * per_A[None], d_new))
             d_force = jnp.where(left[None], 0, A[None] * d_new + all_pushed)
         dh = tuple(pushed[b] + share[b][None] * d_new for b in branches)
         h = tuple(kept[b] * h[b] + share[b] * moved for b in branches)
         return (h, new, dh, d_new), (force, new, d_force, d_new if surface else None)
 
-    zero = jnp.zeros_like(elastic[0])
     none = jnp.concatenate([none_of_columns, none_along])
     start = (zero,) * gamma.shape[0], zero, (none,) * gamma.shape[0], none
     return jax.lax.scan(step, start, (x, lost, elastic, columns))[1]
@@ -349,14 +357,14 @@ def _lanes_last(loop):
         def last(v, own):
             return jnp.moveaxis(v, 0, -1) if own else jnp.repeat(v[..., None], count, axis=-1)
 
-        found = call(*map(last, arrays, has_lanes))
+        found = call(*jax.tree.map(last, arrays, tuple(has_lanes)))
         lanes_first = jax.tree.map(lambda v: jnp.moveaxis(v, -1, 0), found)
         return lanes_first, jax.tree.map(lambda _: True, found)
 
     return call
 
 
-def _differentiable(loop):
+def differentiable_in_lanes(loop):
     """The loop in lanes; its derivatives are those of the loop as it stands, in both modes."""
     in_lanes = jax.custom_jvp(_lanes_last(loop))
 
@@ -367,5 +375,5 @@ def _differentiable(loop):
     return in_lanes
 
 
-_filter = _differentiable(_loop)
-_bonded_filter = _differentiable(_bonded_loop)
+_filter = differentiable_in_lanes(_loop)
+_bonded_filter = differentiable_in_lanes(_bonded_loop)

@@ -1,0 +1,115 @@
+r"""Local law and skeleton relax apart: branches of their own, one equilibrium a sample.
+
+Both parts are as in `mechanics.relaxation`, the local law with the elastic force e(d) and the
+skeleton with y = u / c. At the end of a step both carry the contact force,
+
+    F = A e(d) + B = A_s y + B_s,   d + c y = D,
+
+so d + (c A / A_s) e(d) = D - c (B - B_s) / A_s: the law in series with another compliance, and a
+displacement that is shifted (`Law.series`). A unilateral contact lets go where F < 0: the tool has
+left, and either part recovers by itself, e = -B / A and y = -B_s / A_s.
+
+Of parts with the same branches the force is that of `relax` of the elastic press.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxtrachea._numerics import added
+from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.relaxation import Branches, differentiable_in_lanes, factors, fading
+
+
+class Parts(NamedTuple):
+    """A press in time, one entry per sample.
+
+    Attributes:
+        force: N.
+        depth: local indentation, mm; where the tool has left, of the surface as it is.
+        load: elastic force of the skeleton, N, which C and the joints follow.
+        folded: whether the press is past the fold; it and all later ones are NaN.
+    """
+
+    force: Float[Array, " N"]
+    depth: Float[Array, " N"]
+    load: Float[Array, " N"]
+    folded: Bool[Array, " N"]
+
+
+def relax_parts(
+    time: Float[Array, " N"],
+    displacement: Float[Array, " N"],
+    compliance: Float[Array, ""],
+    law: Law,
+    local: Branches,
+    skeleton: Branches,
+    unilateral: bool = True,
+) -> Parts:
+    """Press in time, from rest before the first sample; of second order in the step.
+
+    Args:
+        time: s, never falling; padding as in `relax`.
+        displacement: D after first touch, mm.
+        compliance: c of the skeleton, mm/N, in the long run.
+        law: local law, in the long run.
+        local: branches of the local law.
+        skeleton: branches of the skeleton, all of it alike.
+        unilateral: the contact lets go where it would pull (static).
+    """
+    loop = _unilateral if unilateral else _bonded
+    given = (*fading(time, local), *fading(time, skeleton))
+    return Parts(*loop(*given, displacement, compliance, law, local.gamma, skeleton.gamma))
+
+
+def _loop(
+    x,
+    lost,
+    x_s,
+    lost_s,
+    displacement,
+    compliance,
+    law: Law,
+    gamma,
+    gamma_s,
+    unilateral: bool = True,
+):
+    """Force, depth, load and fold; arrays may have lanes as their last axis: `relaxation`."""
+
+    def step(state, sample):
+        h, e, q, y = state
+        x, lost, x_s, lost_s, D = sample
+        kept, _, share = factors(x, lost, gamma)
+        kept_s, _, share_s = factors(x_s, lost_s, gamma_s)
+        A, B = 1 + added(share), _carried(kept, share, h, e)
+        A_s, B_s = 1 + added(share_s), _carried(kept_s, share_s, q, y)
+        solved = law.series(D - compliance * ((B - B_s) / A_s), compliance * (A / A_s))
+        force, new, depth = A * solved.force + B, solved.force, solved.depth
+        if unilateral:
+            left = force < 0
+            alone = jnp.where(left, -B / A, 0)
+            force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
+            depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0), depth)
+        load = (force - B_s) / A_s
+        h = tuple(E * h + P * (new - e) for E, P, h in zip(kept, share, h, strict=True))
+        q = tuple(E * q + P * (load - y) for E, P, q in zip(kept_s, share_s, q, strict=True))
+        return (h, new, q, load), (force, depth, load, solved.folded)
+
+    zero = jnp.zeros_like(displacement[0])
+    start = (zero,) * gamma.shape[0], zero, (zero,) * gamma_s.shape[0], zero
+    return jax.lax.scan(step, start, (x, lost, x_s, lost_s, displacement))[1]
+
+
+def _carried(kept, share, h, e):
+    """B: what a step carries over of a part."""
+    return added(E * h - P * e for E, P, h in zip(kept, share, h, strict=True))
+
+
+def _bonded_loop(*given):
+    return _loop(*given, unilateral=False)
+
+
+_unilateral = differentiable_in_lanes(_loop)
+_bonded = differentiable_in_lanes(_bonded_loop)
