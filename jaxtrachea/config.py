@@ -247,8 +247,10 @@ class ModelSection(Section):
     """`softening`: deep presses, with `e_1` and `e_2`. `sections`: rings that change their shape,
     anywhere on them and deep; needs `contact = "bonded"` and no other option of this table
     """
-    relaxation: Literal["off", "uniform"] = "off"
-    """`uniform`: the force relaxes, all parts alike; reads the time (`loading = "record"`)"""
+    relaxation: Literal["off", "uniform", "parts"] = "off"
+    """`uniform`: the force relaxes, all parts alike; `parts`: local contact and skeleton apart.
+    Both read the time (`loading = "record"`)
+    """
     branches: Literal["prony-1", "prony-2", "prony-3", "prony-4", "power", "fung"] = "prony-2"
     """law of the relaxation"""
 

@@ -57,6 +57,7 @@ class PressStatus(_Described):
         "solved, but by stiffnesses that moduli give for a tube unlike the one on which their "
         "factors were found: forces up to 30 % off; fit them to presses of this tube",
     )
+    BACK_IN_TIME = 15, "the time is before that of an earlier sample, or no number"
 
     @property
     def solved(self) -> bool:

@@ -14,8 +14,6 @@ from jaxtrachea.fitting.parameters import Parameter, Scale
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.level import Level
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.levels.relaxing import ANY_SPAN
-from jaxtrachea.mechanics.relaxation_laws import Span
 from jaxtrachea.trachea.geometry import Geometry
 
 Common = Literal["all", "beam", "nothing"]
@@ -60,7 +58,6 @@ class FitModel:
         columns: all parameters, free and fixed, in order.
         loss: `linear`, `huber`, `soft_l1` or `cauchy`.
         loss_scale: residual, in standard deviations, where the loss turns robust.
-        span: times of the records, s, where the force relaxes.
         common: what all trials of a lane have in common, in every lane: `all` unknowns, the `beam`,
             or `nothing`.
     """
@@ -71,7 +68,6 @@ class FitModel:
     loss: Loss = "linear"
     loss_scale: float = 1.345
     common: Common = "nothing"
-    span: Span = ANY_SPAN
 
     def __post_init__(self):
         """Refuse words that mean nothing.
@@ -85,7 +81,7 @@ class FitModel:
     @property
     def level(self) -> Level:
         """The level that the options ask for."""
-        return level_of(self.options, self.span)
+        return level_of(self.options)
 
     @property
     def relaxes(self) -> bool:

@@ -16,10 +16,16 @@ from jaxtyping import Array, Float
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.levels.relaxing import ANY_SPAN
-from jaxtrachea.mechanics.relaxation import Branches, relax, relax_with_derivatives
-from jaxtrachea.mechanics.relaxation_laws import LAWS, Span
+from jaxtrachea.mechanics.relaxation import (
+    Branches,
+    Relaxation,
+    relax,
+    relax_with_derivatives,
+)
+from jaxtrachea.mechanics.relaxation_laws import LAWS, OF_SKELETON, Span
+from jaxtrachea.mechanics.relaxation_laws import names as names_of
 from jaxtrachea.trachea.material import OF_TIME
 
 #: Relaxation times are sought from this share of the shortest step to so many longest records.
@@ -39,12 +45,16 @@ def span_of(curves: Sequence[Curve]) -> Span:
     return Span(min(steps), longest)
 
 
-def static_span(options: Options, span: Span) -> Span:
-    """The span that chooses the program: in half decades, and only where a law reads it."""
+def with_span(options: Options, span: Span) -> Options:
+    """The options with the span of the records: in half decades, where the law reads it.
+
+    Studies alike share programs.
+    """
     if options.branches not in _OF_SPAN:
-        return ANY_SPAN
+        return options
     low, high = (math.log10(v) * 2 for v in span)
-    return Span(10 ** (math.floor(low + 1e-9) / 2), 10 ** (math.ceil(high - 1e-9) / 2))
+    shortest, longest = math.floor(low + 1e-9) / 2, math.ceil(high - 1e-9) / 2
+    return dataclasses.replace(options, shortest=10**shortest, longest=10**longest)
 
 
 def by_records(
@@ -71,10 +81,11 @@ def by_records(
     out = []
     for p in parameters:
         usual = DEFAULTS[p.name]
-        if p.fixed or p.name not in begins:
+        name = p.name.removesuffix(OF_SKELETON)
+        if p.fixed or name not in begins:
             out.append(p)
             continue
-        value, lower, upper = begins[p.name]
+        value, lower, upper = begins[name]
         bounds = {} if (p.lower, p.upper) != (usual.lower, usual.upper) else {
             "lower": min(lower, value), "upper": max(upper, value),
         }  # fmt: skip
@@ -89,74 +100,89 @@ def by_records(
 
 def numbers(model: FitModel, values: dict[str, Array]) -> Float[Array, " K"]:
     """Numbers of the law of relaxation, of the values of one trial."""
-    return jnp.stack([values[name] for name in LAWS[model.options.branches].names])
+    names = names_of(model.options.branches, parts=model.options.relaxation == "parts")
+    return jnp.stack([values[name] for name in names])
+
+
+def _relaxation(model: FitModel, values: dict[str, Array]) -> Relaxation:
+    found = model.level.relaxation(values)
+    assert found is not None
+    return found
 
 
 def relaxed_value(
-    model: FitModel, values: dict[str, Array], time: Float[Array, " N"], force, load
+    model: FitModel, values: dict[str, Array], time: Float[Array, " N"], elastic: Equilibrium
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     """Force of a press that relaxes, and the load that its rings follow, N.
+
+    Of a skeleton that softens the force of small strain relaxes (`press_in_time`).
 
     Args:
         model: what is fitted (static).
         values: every parameter of the trial by name.
         time: s.
-        force: of the elastic level.
-        load: that the rings would follow there.
+        elastic: press.
     """
-    branches = model.level.branches(values)
-    assert branches is not None
-    relaxed = relax(time, force, branches, _lets_go(model))
-    return relaxed.force, jnp.where(relaxed.elastic == force, load, relaxed.elastic)
+    branches, lets_go = _relaxation(model, values).local, _lets_go(model)
+    if elastic.load is None:
+        return relax(time, elastic.force, branches, lets_go)
+    force, load = relax(time, elastic.load, branches, lets_go)
+    return _ratio(elastic.force, elastic.load) * force, load
+
+
+def _ratio(force, load):
+    """How much less a skeleton that softens bears; 1 without a load."""
+    return jnp.where(load == 0, 1, force / jnp.where(load == 0, 1, load))
 
 
 def relaxed_press(
     model: FitModel, free: Float[Array, " Jf"], value, time: Float[Array, " N"], pressed: Any
 ) -> Any:
-    """A press as its force relaxes: `residual.Pressed` anew, with its derivatives.
+    """A press as its force relaxes, see `relaxed_value`, with its derivatives.
 
     Args:
         model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units.
         time: s.
-        pressed: of the elastic level; derivatives by the numbers of the relaxation are 0 there.
+        pressed: `residual._Pressed` of the elastic level; derivatives by the numbers of the
+            relaxation are 0 there.
     """
     of_time = [i for i, p in enumerate(model.free) if p.name in OF_TIME]
     elastic = [i for i, p in enumerate(model.free) if p.name not in OF_TIME]
 
     def at(free) -> Branches:
-        found = model.level.branches(values_of(model, free, value))
-        assert found is not None
-        return found
+        return _relaxation(model, values_of(model, free, value)).local
 
     def push(tangent):
         return jax.jvp(at, (free,), (tangent,))
 
     tangents = jnp.asarray(np.eye(len(model.free))[of_time], free.dtype)
     branches, along = jax.vmap(push, out_axes=(None, 0))(tangents)
-    columns = pressed.d_force[np.array(elastic, int)]
-    if pressed.corner is not None:  # linear in the force like its derivatives
-        columns = jnp.concatenate([columns, pressed.corner[None]])
-    marked = pressed.d_joints is not None
+    columns = pressed.d_load[np.array(elastic, int)]
+    softens, load = pressed.load is not pressed.force, pressed.load
+    ratio = _ratio(pressed.force, load) if softens else 1.0
+    if pressed.corner is not None:  # linear in the load like its derivatives
+        columns = jnp.concatenate([columns, (pressed.corner / ratio)[None]])
     relaxed, slopes = relax_with_derivatives(
-        time, pressed.force, columns, branches, _lets_go(model), along, surface=marked
-    )
+        time, pressed.load, columns, branches, _lets_go(model), along,
+        surface=pressed.d_joints is not None,
+    )  # fmt: skip
     last = len(elastic) + (pressed.corner is not None)
     order = np.argsort([*elastic, *of_time], kind="stable")
 
     def in_order(v):
-        return jnp.concatenate([v[: len(elastic)], v[last:]])[order]
+        return None if v is None else jnp.concatenate([v[: len(elastic)], v[last:]])[order]
 
-    load, d_load = pressed.load, pressed.d_load
-    if marked:
-        left = relaxed.elastic != pressed.force
-        load = jnp.where(left, relaxed.elastic, load)
-        assert slopes.elastic is not None
-        d_load = jnp.where(left[None], in_order(slopes.elastic), d_load)
+    force, d_force = relaxed.force, in_order(slopes.force)
+    corner = None if pressed.corner is None else slopes.force[len(elastic)]
+    if softens:
+        d_ratio = (pressed.d_force - ratio * pressed.d_load) / jnp.where(load == 0, 1, load)
+        d_force = ratio * d_force + jnp.where(load == 0, 0, d_ratio) * force
+        force, corner = ratio * force, None if corner is None else ratio * corner
     return pressed._replace(
-        force=relaxed.force, d_force=in_order(slopes.force), load=load, d_load=d_load,
-        corner=None if pressed.corner is None else slopes.force[len(elastic)],
+        force=force, d_force=d_force, load=relaxed.elastic, d_load=in_order(slopes.elastic),
+        corner=corner,
     )  # fmt: skip
 
 

@@ -109,7 +109,7 @@ def residual(
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    if model.level.closed is None:
+    if model.level.forward:
         return Residual(*forward_residual.residual(model, free, of_press(lane), tube))
     skeleton, by_beam = _skeleton_and_derivative(model, free, _places(lane), tube)
 
@@ -124,7 +124,7 @@ def residual_value(
 ) -> Float[Array, "T m"]:
     """`residual` without its Jacobian."""
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    if model.level.closed is None:
+    if model.level.forward:
         return forward_residual.residual_value(model, free, of_press(lane), tube)
     skeleton = _skeleton(model, free, _places(lane), tube)
 
@@ -135,7 +135,7 @@ def residual_value(
         force, load = solved.force, solved.force if solved.load is None else solved.load
         if model.relaxes:
             values = values_of(model, free, trial.value)
-            force, load = relaxed_value(model, values, trial.time, force, load)
+            force, load = relaxed_value(model, values, trial.time, solved)
         joints = None if skeleton.joints is None else _times(load, skeleton.joints)
         without = at.force_offset
         if at.force_slope is not None:
@@ -405,7 +405,7 @@ def force_jacobian(
     """
     tube = _tube(model, None, free.dtype)
     motion = Motion(s_c, displacement, blend=blend, time=time)
-    if model.level.closed is None:
+    if model.level.forward:
         if phi_c is not None:
             along = jnp.asarray([1.0, 0.0], free.dtype)
             motion = motion._replace(phi_c=phi_c, direction=along)

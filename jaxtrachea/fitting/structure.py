@@ -30,7 +30,7 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.levels.level import Closed
 from jaxtrachea.mechanics.press import Contact
-from jaxtrachea.mechanics.relaxation_laws import LAWS
+from jaxtrachea.mechanics.relaxation_laws import names
 from jaxtrachea.mechanics.softening import Softening
 
 #: Points of the parameter box, and half its width in decades.
@@ -346,10 +346,9 @@ def _curve_sees(study: Study) -> Float[np.ndarray, "r n"]:
     V = _generic(closed, tuple(_higher(study).items()), line)
     if not study.model.relaxes:
         return V
-    count = len(LAWS[study.model.options.branches].names)
-    return np.block(
-        [[V, np.zeros((len(V), count))], [np.zeros((count, V.shape[1])), np.eye(count)]]
-    )
+    options, n = study.model.options, V.shape[1]
+    count = len(names(options.branches, parts=options.relaxation == "parts"))
+    return np.concatenate([np.pad(V, ((0, 0), (0, count))), np.eye(count, n + count, n)])
 
 
 def _higher(study: Study) -> dict[str, bool]:

@@ -50,12 +50,11 @@ from jaxtrachea.fitting.parameters import (
     in_model,
 )
 from jaxtrachea.fitting.refusals import Size, as_read, check_noise, depths, refusal
-from jaxtrachea.fitting.relaxing import by_records, span_of, static_span
+from jaxtrachea.fitting.relaxing import by_records, span_of, with_span
 from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.levels.relaxing import ANY_SPAN
 from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -343,11 +342,11 @@ def build_study(
     check_noise(curves, noise.force)
     own = resolved(table, curves, options, noise.force)
     parameters = natural_steps(own.parameters, curves, own.taken)
-    relaxes, span = options.relaxation != "off", ANY_SPAN
+    relaxes = options.relaxation != "off"
     if relaxes:
         span = span_of(curves)
         parameters = by_records(parameters, options, span)
-        span = static_span(options, span)
+        options = with_span(options, span)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
@@ -368,7 +367,7 @@ def build_study(
     model = FitModel(
         tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
         loss=weighting.loss, loss_scale=float(weighting.loss_scale),
-        common=_common(unknowns, parameters, own), span=span,
+        common=_common(unknowns, parameters, own),
     )  # fmt: skip
     return Study(
         model=model,

@@ -154,7 +154,7 @@ def compliance(
     Raises:
         ValueError: as `press`.
     """
-    check_line(options, "compliance")
+    check_line(options, "compliance", timed=True)  # of the long run
     check_shapes(geometry, material)
     return _compliance(geometry, material, real("s_c", s_c, float_type(geometry)), options)
 

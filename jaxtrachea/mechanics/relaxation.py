@@ -45,6 +45,18 @@ class Branches(NamedTuple):
     tau: Float[Array, " B"]
 
 
+class Relaxation(NamedTuple):
+    """What relaxes.
+
+    Attributes:
+        local: branches of the local law; of the whole organ where the skeleton has none.
+        skeleton: branches of the skeleton; None: all parts relax alike.
+    """
+
+    local: Branches
+    skeleton: Branches | None = None
+
+
 class Relaxed(NamedTuple):
     """A force in time.
 

@@ -23,8 +23,10 @@ import numpy as np
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
-from jaxtrachea.mechanics.relaxation import Branches
+from jaxtrachea.mechanics.relaxation import Branches, Relaxation
 
+#: What the name of a number ends in where it is the skeleton's.
+OF_SKELETON = "_skeleton"
 #: Words of the laws.
 Word = Literal["prony-1", "prony-2", "prony-3", "prony-4", "power", "fung"]
 #: Of `power`: nodes a decade, and decades beyond the span in which its nodes lie.
@@ -55,6 +57,33 @@ class RelaxationLaw(NamedTuple):
 
     names: tuple[str, ...]
     branches: Callable[[Mapping[str, Float[Array, ""]], Span], Branches]
+
+
+def relaxation(
+    word: Word, values: Mapping[str, Float[Array, ""]], span: Span, *, parts: bool = False
+) -> Relaxation:
+    """What relaxes, from the numbers of a law.
+
+    Args:
+        word: of the law (static), of either part.
+        values: its numbers by name; those of the skeleton end in `_skeleton`.
+        span: see `branches`.
+        parts: whether the skeleton relaxes apart (static).
+
+    Raises:
+        ValueError: as `branches`.
+    """
+    local = branches(word, values, span)
+    if not parts:
+        return Relaxation(local)
+    own = {k.removesuffix(OF_SKELETON): v for k, v in values.items() if k.endswith(OF_SKELETON)}
+    return Relaxation(local, branches(word, own, span))
+
+
+def names(word: Word, *, parts: bool = False) -> tuple[str, ...]:
+    """Names of the numbers that `relaxation` reads."""
+    local = LAWS[word].names
+    return local + tuple(name + OF_SKELETON for name in local if parts)
 
 
 def branches(word: Word, values: Mapping[str, Float[Array, ""]], span: Span) -> Branches:

@@ -91,7 +91,7 @@ def _loop(
             left = force < 0
             alone = jnp.where(left, -B / A, 0)
             force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
-            depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0), depth)
+            depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0.0), depth)
         load = (force - B_s) / A_s
         h = tuple(E * h + P * (new - e) for E, P, h in zip(kept, share, h, strict=True))
         q = tuple(E * q + P * (load - y) for E, P, q in zip(kept_s, share_s, q, strict=True))

@@ -19,9 +19,7 @@ from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
 from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
-from jaxtrachea.mechanics.levels.relaxing import ANY_SPAN
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.mechanics.relaxation_laws import Span
 from jaxtrachea.results.arrays import PLACES, result_of
 from jaxtrachea.results.hdf5 import SCHEMA, VERSION
 from jaxtrachea.results.store import BY_SAMPLE, GEOMETRY, read_data, read_json
@@ -192,7 +190,6 @@ def _study(file: Any, model: dict[str, Any], place: _Places, curves: tuple[Curve
             loss=model["loss"],
             loss_scale=float(model["loss_scale"]),
             common=model["common"],
-            span=Span(*model["span"]) if "span" in model else ANY_SPAN,
         ),
         parameters=parameters,
         lanes=_lanes(file["data"], place, arrays),

@@ -53,7 +53,6 @@ def write(
             "loss": study.model.loss,
             "loss_scale": study.model.loss_scale,
             "common": study.model.common,
-            "span": study.model.span,
             "noise_given": study.noise_given,
             "balance": study.balance,
             "marker_noise": study.marker_noise,

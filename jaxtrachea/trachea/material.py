@@ -306,7 +306,12 @@ VALUES: dict[str, Declaration] = {
     field.name: field.metadata["declaration"] for field in dataclasses.fields(Material)
 }
 #: Those of relaxation.
-OF_TIME: dict[str, Declaration] = {p.name: p for p in _OF_TIME}
+OF_TIME: dict[str, Declaration] = {
+    name: dataclasses.replace(p, name=name, description=p.description + what)
+    for suffix, what in (("", ""), ("_skeleton", ", of the skeleton apart"))
+    for p in _OF_TIME
+    for name in (p.name + suffix,)
+}
 #: Those of single presses.
 OF_PRESS: dict[str, Declaration] = {p.name: p for p in _OF_THE_PRESS}
 #: Every parameter of a line of joints, likewise; those of single presses last.

@@ -9,9 +9,8 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea.mechanics.levels.level import Level
 from jaxtrachea.mechanics.levels.line import Line
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.levels.relaxing import ANY_SPAN, Relaxation
+from jaxtrachea.mechanics.levels.relaxing import Relaxing
 from jaxtrachea.mechanics.levels.sections import Sections
-from jaxtrachea.mechanics.relaxation_laws import Span
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.trachea.material import OF_TIME, Declaration, Material
 
@@ -26,16 +25,12 @@ DECLARED: Mapping[str, Declaration] = functools.reduce(
 
 
 @functools.lru_cache(maxsize=256)
-def level_of(options: Options, span: Span = ANY_SPAN) -> Level:
-    """The level that options ask for; equal where they are.
-
-    Args:
-        options: -
-        span: times of the records, s; read where the force relaxes.
-    """
-    elastic = dataclasses.replace(options, relaxation="off", branches=Options.branches)
-    level = LEVELS[options.skeleton](elastic)
-    return level if options.relaxation == "off" else Relaxation(level, options, span)
+def level_of(options: Options) -> Level:
+    """The level that options ask for; equal where they are."""
+    if options.relaxation == "off":
+        return LEVELS[options.skeleton](options)
+    elastic = LEVELS[options.skeleton](dataclasses.replace(options, relaxation="off"))
+    return Relaxing(elastic, options)
 
 
 def level_type(material: AnyMaterial) -> type[Level]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Contact
-from jaxtrachea.mechanics.relaxation import Branches
+from jaxtrachea.mechanics.relaxation import Relaxation
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Declaration
 
@@ -181,6 +181,11 @@ class Level(abc.ABC):
         return None
 
     @property
+    def forward(self) -> bool:
+        """Whether its press is differentiated as it stands, in forward mode."""
+        return self.closed is None
+
+    @property
     def off_midline(self) -> bool:
         """Whether it presses at any angle on the rings, and across the tube."""
         return "side_force" in self.observes
@@ -190,7 +195,7 @@ class Level(abc.ABC):
         """What of it the options chose, in words."""
         return ()
 
-    def branches(self, values: Mapping[str, Array]) -> Branches | None:
+    def relaxation(self, values: Mapping[str, Array]) -> Relaxation | None:
         """How its force relaxes; None: it does not."""
         return None
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 from jaxtrachea._arguments import check_record, check_word
 from jaxtrachea.mechanics import beam as _beam
-from jaxtrachea.mechanics.relaxation_laws import Word
+from jaxtrachea.mechanics import relaxation_laws
 
 #: Words of the skeletons; `levels.choose` has the level of each.
 Skeleton = Literal["linear", "softening", "sections"]
@@ -37,9 +37,11 @@ class Options:
             (needs `Material.e_1` and `e_2`, and `series`); or `sections`, in fits: deforming
             cross-sections, anywhere on the rings and at finite strain (`bonded`; no other option
             but `half_width` applies). `press_sections` presses that one.
-        relaxation: `off` (elastic), or in fits `uniform`: all parts relax alike, and the force is a
-            filter of the elastic one by the time (`mechanics.relaxation`).
-        branches: the law of the relaxation, see `mechanics.relaxation_laws`.
+        relaxation: `off`, or how the force relaxes in time: `uniform`, the whole organ alike, or
+            `parts`, local law and skeleton apart (needs `series`, and no `sections`).
+        branches: the law of relaxation, see `mechanics.relaxation_laws`.
+        shortest: step of the records, s, from which on `power` is one.
+        longest: of the records, s, up to which it is.
     """
 
     coupling: Literal["series", "total"] = "series"
@@ -52,8 +54,10 @@ class Options:
     transition: float | None = None
     half_width: float = 0.0
     skeleton: Skeleton = "linear"
-    relaxation: Literal["off", "uniform"] = "off"
-    branches: Word = "prony-2"
+    relaxation: Literal["off", "uniform", "parts"] = "off"
+    branches: relaxation_laws.Word = "prony-2"
+    shortest: float = 1e-3
+    longest: float = 1e3
 
     def __post_init__(self):
         """Refuse words and numbers that no model has, and options that exclude each other.
@@ -74,12 +78,36 @@ class Options:
                 "skeleton='softening' needs coupling='series': with 'total' the force does not "
                 "depend on the skeleton"
             )
+        if not 0 < self.shortest <= self.longest:
+            raise ValueError(
+                f"shortest is {self.shortest:g} s, longest {self.longest:g} s; expected "
+                "0 < shortest <= longest"
+            )
+        if self.relaxation == "parts":
+            self._check_parts()
         for name, only in _ONLY.get(self.skeleton, {}).items():
             if (value := getattr(self, name)) != only:
                 why = "the tool sticks to the wall" if name == "contact" else _NO_OTHER
                 raise ValueError(
                     f"skeleton={self.skeleton!r} needs {name}={only!r}, found {value!r}: {why}"
                 )
+
+    def _check_parts(self):
+        if self.coupling != "series":
+            raise ValueError(
+                "relaxation='parts' needs coupling='series': with 'total' the force does not "
+                "depend on the skeleton; choose 'uniform'"
+            )
+        if self.skeleton not in _OF_LINE:
+            raise ValueError(
+                f"relaxation='parts' is not derived for skeleton={self.skeleton!r}, whose wall has "
+                "no compliance of its own; choose 'uniform'"
+            )
+
+    @property
+    def span(self) -> relaxation_laws.Span:
+        """Times of the records."""
+        return relaxation_laws.Span(self.shortest, self.longest)
 
     def places(self, length: float) -> tuple[float, float]:
         """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
@@ -99,8 +127,13 @@ _NO_OTHER = "no other applies to it"
 _OF_LINE = ("linear", "softening")
 
 
-def check_line(options: Options, what: str) -> None:
+def check_line(options: Options, what: str, *, timed: bool = False) -> None:
     """Refuse a skeleton of deforming cross-sections where a line of joints is pressed.
+
+    Args:
+        options: of the press.
+        what: was called.
+        timed: whether time enters there; else a force that relaxes is refused.
 
     Raises:
         ValueError: naming what was called and the cure; or no `Options`.
@@ -111,8 +144,8 @@ def check_line(options: Options, what: str) -> None:
             f"{what} presses a line of joints, not skeleton={options.skeleton!r}; "
             "use press_sections"
         )
-    if options.relaxation != "off":
+    if options.relaxation != "off" and not timed:
         raise ValueError(
-            f"{what} is elastic, not relaxation={options.relaxation!r}; use relaxation.relax on "
-            "its force, by the time"
+            f"{what} knows no time, and options.relaxation is {options.relaxation!r}; use "
+            "press_in_time, or relaxation='off'"
         )

@@ -10,27 +10,25 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.admission import has_solution
 from jaxtrachea.mechanics.levels.level import Closed, Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.relaxation import Branches, Relaxed, relax
-from jaxtrachea.mechanics.relaxation_laws import LAWS, Span, branches
+from jaxtrachea.mechanics.press_in_time import press_in_time
+from jaxtrachea.mechanics.relaxation import Relaxation, relax
+from jaxtrachea.mechanics.relaxation_laws import names, relaxation
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_TIME
 
-#: Times that branches reach over where no records are known, s.
-ANY_SPAN = Span(1e-4, 1e5)
 
-
-class Relaxing(NamedTuple):
-    """Values of a level that relaxes: of the level within, and the branches."""
+class Lasting(NamedTuple):
+    """Values of a level that relaxes: of the level within, which last, and what relaxes."""
 
     elastic: Any
-    branches: Branches
+    relaxation: Relaxation
 
 
 def _of_within(name: str) -> Any:
@@ -39,18 +37,16 @@ def _of_within(name: str) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
-class Relaxation(Level):
+class Relaxing(Level):
     """A level whose force relaxes.
 
     Attributes:
         within: the elastic level.
         options: that asked for it.
-        span: times of the records, s (static).
     """
 
     within: Level
     options: Options
-    span: Span = ANY_SPAN
 
     observes = _of_within("observes")
     material_type = _of_within("material_type")
@@ -81,13 +77,23 @@ class Relaxation(Level):
         return self.within.closed
 
     @property
+    def forward(self) -> bool:
+        """Where parts relax apart, every sample is an equilibrium with a past."""
+        return self.options.relaxation == "parts" or self.within.forward
+
+    @property
     def parts(self) -> tuple[str, ...]:
         """And the law of relaxation."""
         return (*self.within.parts, f"relaxing ({self.options.branches})")
 
     def needs(self, *, joints: bool) -> frozenset[str]:
         """And the numbers of the law."""
-        return self.within.needs(joints=joints) | frozenset(LAWS[self.options.branches].names)
+        return self.within.needs(joints=joints) | frozenset(self.numbers)
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the numbers of its relaxation."""
+        return names(self.options.branches, parts=self.options.relaxation == "parts")
 
     def admits(self, curve: Record, size: Size, onset: float = 0.0) -> InputError | None:
         """As the level within, and by a time that runs."""
@@ -101,55 +107,38 @@ class Relaxation(Level):
             return InputError("its time does not run from the first sample to the last", cure=cure)
         return self.within.admits(curve, size, onset)
 
-    def material(self, values: Mapping[str, Array]) -> Relaxing:
+    def material(self, values: Mapping[str, Array]) -> Lasting:
         """Values by name."""
-        return Relaxing(self.within.material(values), self.branches(values))
+        return Lasting(self.within.material(values), self.relaxation(values))
 
-    def branches(self, values: Mapping[str, Array]) -> Branches:
-        """See `relaxation_laws.branches`."""
-        return branches(self.options.branches, values, self.span)
+    def relaxation(self, values: Mapping[str, Array]) -> Relaxation:
+        """See `relaxation_laws.relaxation`."""
+        word, parts = self.options.branches, self.options.relaxation == "parts"
+        return relaxation(word, values, self.options.span, parts=parts)
 
-    @property
-    def unilateral(self) -> bool:
-        """Whether the tool lets go."""
-        return self.options.contact == "unilateral"
-
-    def response(self, tube: Geometry, material: Relaxing, motion: Motion) -> Response:
-        """See `relax`; the rings follow the shape, what they bear the force.
+    def response(self, tube: Geometry, material: Lasting, motion: Motion) -> Response:
+        """Of a line `press_in_time`, else the elastic force of the level within, which relaxes.
 
         Raises:
             ValueError: no time.
         """
         if motion.time is None:
             raise ValueError("motion.time is None; a force that relaxes needs the time")
-        found = self.within.response(tube, material.elastic, motion)
-        relaxed = relax(motion.time, found.force, material.branches, self.unilateral)
+        if self.within.closed is not None:
+            found = press_in_time(
+                tube, material.elastic, motion.s_c, motion.time, motion.displacement,
+                material.relaxation, self.options, onset=motion.onset, blend=motion.blend,
+            )  # fmt: skip
+            return Response(found.force, found.joints, found.status, reactions=found.reactions)
+        found, local = (
+            self.within.response(tube, material.elastic, motion),
+            material.relaxation.local,
+        )
+        unilateral = self.options.contact == "unilateral"
+        force = relax(motion.time, found.force, local, unilateral).force
         side = found.side_force
         if side is not None:
-            side = relax(motion.time, side, material.branches, False).force
-        lost = has_solution(found.status) & ~jnp.isfinite(relaxed.force)
-        status = jnp.where(lost, PressStatus.NON_FINITE, found.status)
-        joints, reactions = found.joints, found.reactions
-        if self.unilateral:
-            left = left_behind(found.force, relaxed)
-            joints = jnp.where(
-                left[:, None], _per_force(found.force, joints, relaxed.elastic), joints
-            )
-        if reactions is not None:
-            reactions = _per_force(found.force, reactions, relaxed.force)
-        return found._replace(
-            force=relaxed.force, side_force=side, joints=joints, reactions=reactions,
-            status=status.astype(found.status.dtype),
-        )  # fmt: skip
-
-
-def left_behind(elastic: Float[Array, " N"], relaxed: Relaxed) -> Bool[Array, " N"]:
-    """Where the tool has left the surface, which recovers by itself."""
-    return relaxed.elastic != elastic
-
-
-def _per_force(elastic, v, force):
-    """What goes with a force, as it went with the largest elastic one."""
-    at = jnp.argmax(jnp.abs(elastic))
-    unit = v[at] / jnp.where(elastic[at] == 0, 1, elastic[at])
-    return force[:, None] * unit[None]
+            side = relax(motion.time, side, local, False).force
+        lost = has_solution(found.status) & ~jnp.isfinite(force)  # after one without a solution
+        status = jnp.where(lost, PressStatus.NON_FINITE, found.status).astype(found.status.dtype)
+        return found._replace(force=force, side_force=side, status=status)

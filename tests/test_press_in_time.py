@@ -1,0 +1,116 @@
+"""Presses in time: parts against an ODE and against uniform, lift-off, what is refused."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.mechanics.press_in_time import press_in_time
+from jaxtrachea.mechanics.relaxation import Branches, Relaxation
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+TUBE = Geometry.create(60.0, [15.0, 30.0, 45.0], radius=11.7)
+VALUES = {"EI_L": 1.9, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02}
+QUINTIC = Material(**VALUES, k_5=0.003)
+TWO = Branches(jnp.asarray([0.9, 0.5]), jnp.asarray([0.36, 4.3]))
+OTHER = Branches(jnp.asarray([0.6]), jnp.asarray([1.7]))
+UNIFORM, PARTS = Options(relaxation="uniform"), Options(relaxation="parts")
+TIMES = np.unique(np.r_[np.linspace(0, 1, 40), np.linspace(1, 6, 50), np.linspace(6, 10, 110)])
+WAY = np.interp(TIMES, [0, 1, 6, 7, 9, 10], [0, 4, 4, 0.2, 0.2, 3])
+
+
+@functools.partial(jax.jit, static_argnames="options")
+def run(material, relaxes, options, time=TIMES, way=WAY, s_c=22.0):
+    return press_in_time(TUBE, material, s_c, time, way, relaxes, options)
+
+
+@pytest.mark.parametrize(
+    ("change", "material"),
+    [
+        ({}, QUINTIC),
+        ({}, Material(**VALUES)),
+        ({"local": "two-material"}, dataclasses.replace(QUINTIC, k_1_ring=jnp.asarray(2.0))),
+        ({"half_width": 3.0}, QUINTIC),
+        ({"contact": "bonded"}, QUINTIC),
+        ({"skeleton": "softening"}, Material(**VALUES, e_1=0.08, e_2=0.003)),
+    ],
+    ids=["quintic", "cubic", "two-material", "width", "bonded", "softening"],
+)
+def test_parts_that_relax_alike_are_the_uniform_level(change, material):
+    """With lift-off and recovery; two programs that share no equilibrium."""
+    one = run(material, Relaxation(TWO), dataclasses.replace(UNIFORM, **change))
+    two = run(material, Relaxation(TWO, TWO), dataclasses.replace(PARTS, **change))
+    off = np.asarray(one.force) == 0
+    assert change.get("contact") == "bonded" or 30 < off.sum() < 150
+    for name in ("force", "depth", "skeleton", "joints", "reactions"):
+        a, b = (np.asarray(getattr(v, name)) for v in (one, two))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.abs(a).max(), err_msg=name)
+    np.testing.assert_array_equal(one.status, two.status)
+    assert set(np.unique(one.status)) <= {PressStatus.OK, PressStatus.NO_CONTACT}
+    # Of the surface, in or out of contact: depth and skeleton make its displacement.
+    way = np.asarray(one.depth + one.skeleton)
+    np.testing.assert_allclose(way[~off], WAY[~off], atol=2e-3)
+    assert np.all(way[off] > WAY[off] - 1e-12) or not off[1:].any()
+
+
+def test_without_strength_it_is_the_elastic_press():
+    none = Branches(jnp.zeros(2), TWO.tau)
+    plain = press(TUBE, QUINTIC, 22.0, WAY)
+    for options, relaxes in ((UNIFORM, Relaxation(none)), (PARTS, Relaxation(none, none))):
+        found = run(QUINTIC, relaxes, options)
+        for a, b in zip(found, plain, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
+
+
+def parts_by_ode(times, way, rate, c, law, local, skeleton, top):
+    """Force of two relaxing parts in series; unknown is the depth, and what the branches carry."""
+    (g, tau), (g_s, tau_s) = (tuple(map(np.asarray, b)) for b in (local, skeleton))
+    k_1, k_3, k_5 = law
+
+    def change(t, y):
+        d, h, q = y[0], y[1 : 1 + len(g)], y[1 + len(g) :]
+        stiff = k_1 + 3 * k_3 * d**2 + 5 * k_5 * d**4
+        a, a_s = (1 + g.sum()) * stiff, (1 + g_s.sum()) / c
+        dd = (a_s * rate(t) - np.sum(q / tau_s) + np.sum(h / tau)) / (a + a_s)
+        return np.concatenate(
+            [[dd], g * stiff * dd - h / tau, g_s / c * (rate(t) - dd) - q / tau_s]
+        )
+
+    start = np.zeros(1 + len(g) + len(g_s))
+    found = solve_ivp(change, (0, top), start, method="Radau", rtol=1e-11, atol=1e-13, t_eval=times)
+    d = found.y[0]
+    return k_1 * d + k_3 * d**3 + k_5 * d**5 + found.y[1 : 1 + len(g)].sum(0)
+
+
+@pytest.mark.parametrize("softens", [False, True])
+def test_parts_apart_are_those_of_the_differential_equation(softens):
+    """Order 2 in the step. A skeleton that softens multiplies the force of small strain."""
+    change = {"e_1": 0.08, "e_2": 0.003} if softens else {}
+    skeleton = "softening" if softens else "linear"
+    options = dataclasses.replace(PARTS, skeleton=skeleton, contact="bonded")
+    material = dataclasses.replace(QUINTIC, **{k: jnp.asarray(v) for k, v in change.items()})
+    c = float(press(TUBE, QUINTIC, 22.0, 0.0).compliance)
+
+    def way(t):
+        return 3 * np.sin(0.8 * t) ** 2
+
+    def rate(t):
+        return 2.4 * np.sin(1.6 * t)
+
+    errors = []
+    for count in (60, 120, 240, 480):
+        t = np.linspace(0, 3.5, count + 1)
+        exact = parts_by_ode(t, way, rate, c, (0.3, 0.02, 0.003), TWO, OTHER, 3.5)
+        exact *= 1 - way(t) * (change.get("e_1", 0) - change.get("e_2", 0) * way(t))
+        found = run(material, Relaxation(TWO, OTHER), options, t, way(t))
+        errors.append(np.abs(np.asarray(found.force) - exact).max() / exact.max())
+    assert errors[-1] < 1e-5
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert np.all((orders > 1.9) & (orders < 2.1)), orders
