@@ -30,6 +30,9 @@ from .mechanics.oblique import press_path as press_path
 from .mechanics.press import Options as Options
 from .mechanics.press import Press as Press
 from .mechanics.press import press as press
+from .mechanics.press_in_time import press_in_time as press_in_time
+from .mechanics.relaxation import Branches as Branches
+from .mechanics.relaxation import Relaxation as Relaxation
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
 from .prediction.predict import CurvePrediction as CurvePrediction

@@ -19,9 +19,11 @@ from jaxtrachea.fitting.parameters import DECLARED, DEFAULTS, in_model
 from jaxtrachea.fitting.residual import of_press, of_trials, residual
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics import relaxation_laws
 from jaxtrachea.mechanics.levels.choose import LEVELS, level_of
 from jaxtrachea.mechanics.levels.level import Level, Motion, Response, Size
 from jaxtrachea.mechanics.levels.options import Options, Skeleton
+from jaxtrachea.mechanics.levels.relaxing import Relaxing
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -126,6 +128,54 @@ def test_a_closed_form_is_what_the_response_gives(options, changes):
     assert np.abs(jacobian).max() > 0.1
     np.testing.assert_allclose(value, plain, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(jacobian, slopes, rtol=1e-9, atol=1e-9)
+
+
+TIMED = [
+    Options(relaxation="uniform"),
+    Options(relaxation="parts", branches="fung", skeleton="softening"),
+    Options(relaxation="uniform", branches="power", skeleton="sections", contact="bonded"),
+]
+
+
+@pytest.mark.parametrize("options", TIMED, ids=["line", "parts", "sections"])
+def test_a_level_relaxes_around_any_other(options):
+    """It needs the numbers of its law and a curve's time; at once it is as stiff as 1 + gamma."""
+    level, off = level_of(options), level_of(dataclasses.replace(options, relaxation="off"))
+    assert isinstance(level, Relaxing)
+    assert level.inner.name == off.name == level.name
+    names = relaxation_laws.names(options.branches, parts=options.relaxation == "parts")
+    assert level.needs(joints=True) == off.needs(joints=True) | set(names)
+    assert set(in_model(options, joints=True, named=DECLARED)) == level.needs(joints=True)
+    assert level.observes == off.observes
+    assert not level.stepwise
+    assert level.closed == off.closed
+    assert "no time" in str(level.admits(curve(), SIZE))
+    assert level.admits(curve(time=np.arange(6.0)), SIZE) is None
+    aside = curve(phi_c=0.5, direction=(0.8, 0.6), time=np.arange(6.0))
+    assert (level.admits(aside, SIZE) is None) == off.off_midline
+    values = {n: jnp.asarray(DEFAULTS[n].value) for n in level.needs(joints=True)}
+    D, time = jnp.array([0.5, 0.5, 0.5]), jnp.array([0.0, 0.0, 1e9])
+    motion = Motion(jnp.asarray(20.0), D, onset=jnp.asarray(0.0))
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def both(values):
+        timed = level.response(GEOMETRY, level.material(values), motion._replace(time=time))
+        return timed, off.response(GEOMETRY, off.material(values), motion)
+
+    timed, plain = both(values)
+    assert np.all(timed.status == plain.status)
+    rises = np.asarray(timed.force) / np.asarray(plain.force)
+    assert rises[1] == pytest.approx(rises[0], rel=1e-6)
+    made = level.material(values).relaxation
+    lasts = [float(jnp.sum(jnp.where(b.tau > 1e9, b.gamma, 0))) for b in made if b is not None]
+    assert max(lasts) == pytest.approx(rises[2] - 1, abs=1e-6)
+    strength = 1 + float(jnp.sum(made.local.gamma))
+    assert rises[0] == pytest.approx(strength, rel=1e-9) or options.relaxation == "parts"
+    if level.name == "sections":
+        shape = timed.joints / plain.joints
+        np.testing.assert_allclose(shape[jnp.isfinite(shape)], 1.0)
+    with pytest.raises(ValueError, match="no time"):
+        level.response(GEOMETRY, level.material(values), motion)
 
 
 @dataclasses.dataclass(frozen=True)

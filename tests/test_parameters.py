@@ -20,7 +20,7 @@ from jaxtrachea.mechanics.force_law import ON_RING, Law, coefficient, power
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial
 from jaxtrachea.scene.spec import MaterialSection, load_scene_spec
-from jaxtrachea.trachea.material import OF_PRESS, VALUES, Material, material_of
+from jaxtrachea.trachea.material import OF_PRESS, OF_TIME, VALUES, Material, material_of
 from jaxtrachea.units import unit_factor
 
 PAGE = (Path(__file__).parents[1] / "docs" / "reference.md").read_text()
@@ -95,7 +95,7 @@ def test_models_see_what_their_options_read():
     assert "k_3_ring" in in_model(both, joints=False, named=["k_3_ring"])
     assert "k_3_ring" not in visible(Options(), joints=True)
     deep = Options(shear=True, local="two-material", skeleton="softening")
-    assert set(visible(deep, joints=True)) == set(DEFAULTS) - set(SECTION_VALUES)
+    assert set(visible(deep, joints=True)) == set(DEFAULTS) - set(SECTION_VALUES) - set(OF_TIME)
     sections = Options(skeleton="sections", contact="bonded")
     assert visible(sections, joints=False) == [
         n for n in DECLARED if n in SECTION_VALUES or n in press
@@ -103,6 +103,9 @@ def test_models_see_what_their_options_read():
     free = {n for n in visible(sections, joints=False) if not DEFAULTS[n].fixed}
     assert free == {"EI_C", "Et_L", "D_L", "c_W", "bed_n", "bed_t"}
     assert {"e_1", "e_2"}.isdisjoint(visible(both, joints=True))
+    timed = Options(relaxation="parts", branches="power")
+    own = ["gamma", "beta", "gamma_skeleton", "beta_skeleton"]
+    assert in_model(timed, joints=False) == ["EI_L", "k_M", *local, *own, *press]
 
 
 @pytest.mark.parametrize("name", Law._fields)

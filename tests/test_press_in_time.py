@@ -7,17 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.press_in_time import press_in_time
 from jaxtrachea.mechanics.relaxation import Branches, Relaxation
+from jaxtrachea.mechanics.relaxation_laws import Span, names, relaxation
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
 TUBE = Geometry.create(60.0, [15.0, 30.0, 45.0], radius=11.7)
-VALUES = {"EI_L": 1.9, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02}
+VALUES = {"EI_L": 60.0, "k_M": 3.0, "k_1": 0.3, "k_3": 0.02}
 QUINTIC = Material(**VALUES, k_5=0.003)
 TWO = Branches(jnp.asarray([0.9, 0.5]), jnp.asarray([0.36, 4.3]))
 OTHER = Branches(jnp.asarray([0.6]), jnp.asarray([1.7]))
@@ -114,3 +116,111 @@ def test_parts_apart_are_those_of_the_differential_equation(softens):
     assert errors[-1] < 1e-5
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
     assert np.all((orders > 1.9) & (orders < 2.1)), orders
+
+
+@pytest.mark.parametrize(("options", "relaxes"), [(UNIFORM, Relaxation(TWO)),
+                                                  (PARTS, Relaxation(TWO, OTHER))])  # fmt: skip
+def test_samples_back_in_time_or_at_no_place_are_as_if_not_there(options, relaxes):
+    plain = run(QUINTIC, relaxes, options)
+    time, way = np.insert(TIMES, [50, 120], [0.5, np.nan]), np.insert(WAY, [50, 120], [9.0, 1.0])
+    time, way = np.insert(time, 80, time[80]), np.insert(way, 80, np.nan)
+    found = run(QUINTIC, relaxes, options, time, way)
+    bad = [50, 80, 122]
+    stays = np.delete(np.arange(len(time)), bad)
+    for name in ("force", "depth", "joints", "status"):
+        a, b = np.asarray(getattr(found, name)), np.asarray(getattr(plain, name))
+        np.testing.assert_allclose(a[stays], b, rtol=0, atol=1e-14)
+        assert name == "status" or np.isnan(a[bad]).all()
+    back, nowhere = PressStatus.BACK_IN_TIME, PressStatus.NON_FINITE
+    assert np.asarray(found.status)[bad].tolist() == [back, nowhere, back]
+
+
+@pytest.mark.parametrize(("options", "relaxes"), [(UNIFORM, Relaxation(TWO)),
+                                                  (PARTS, Relaxation(TWO, OTHER))])  # fmt: skip
+def test_after_a_fold_there_is_no_history(options, relaxes):
+    """Nor a derivative: those of the samples before are untouched."""
+    soft = dataclasses.replace(QUINTIC, k_3=jnp.asarray(-0.05), k_5=None)
+    found = run(soft, relaxes, options)
+    elastic = np.asarray(press(TUBE, soft, 22.0, WAY).status)
+    first = np.argmax(elastic > PressStatus.NO_CONTACT)
+    lost = np.asarray(found.status) == elastic[first]
+    assert 10 < first < 40
+    assert lost[first:].all()
+    assert np.isnan(np.asarray(found.force)[first:]).all()
+    cut = run(soft, relaxes, options, TIMES[:first], WAY[:first])
+    np.testing.assert_allclose(found.force[:first], cut.force, rtol=0, atol=1e-14)
+
+    def before(k_1):
+        given = dataclasses.replace(soft, k_1=k_1)
+        return jnp.sum(run(given, relaxes, options).force[: first - 1])
+
+    assert np.isfinite(jax.jit(jax.grad(before))(jnp.asarray(0.3)))
+
+
+def test_a_branch_that_is_none_is_told():
+    for change, status in ((-0.1, PressStatus.BAD_MATERIAL), (np.nan, PressStatus.NON_FINITE)):
+        bad = Branches(TWO.gamma.at[0].set(change), TWO.tau)
+        found = run(QUINTIC, Relaxation(bad), UNIFORM)
+        assert set(np.unique(found.status)) == {status}
+        assert np.isnan(found.force).all()
+
+
+@pytest.mark.parametrize("options", [UNIFORM, PARTS], ids=["uniform", "parts"])
+def test_derivatives_through_lift_off(options):
+    """By stiffnesses, branches and displacement, in both modes."""
+    way = np.interp(TIMES[::8], [0, 1, 6, 7, 9, 10], [0, 4, 4, 0.2, 0.2, 3])
+    parts = options.relaxation == "parts"
+
+    def of(values, log_gamma, log_tau, way):
+        material = Material(values[0], values[1], values[2], values[3], k_5=values[4])
+        branches = Branches(jnp.exp(log_gamma), jnp.exp(log_tau))
+        relaxes = Relaxation(branches, OTHER if parts else None)
+        found = run(material, relaxes, options, jnp.asarray(TIMES[::8]), jnp.asarray(way))
+        return found.force[1:], found.depth[1:], found.skeleton[1:]
+
+    values = jnp.asarray([60.0, 3.0, 0.3, 0.02, 0.003])
+    given = values, jnp.log(TWO.gamma), jnp.log(TWO.tau), jnp.asarray(way + 0.01)
+    assert np.sum(np.asarray(of(*given)[0]) == 0) > 5
+    check_grads(jax.jit(of), given, order=1, rtol=1e-6, atol=1e-6, eps=1e-6)
+
+
+def test_many_presses_side_by_side_are_each_as_if_alone():
+    rng = np.random.default_rng(1)
+    gamma, tau = rng.uniform(0.2, 1, (3, 2)), rng.uniform(0.2, 3, (3, 2))
+
+    def one(gamma, tau, way):
+        return run(QUINTIC, Relaxation(Branches(gamma, tau), OTHER), PARTS, way=way)
+
+    way = np.stack([WAY, 0.5 * WAY, WAY[::-1]])
+    given = jnp.asarray(gamma), jnp.asarray(tau), jnp.asarray(way)
+    together = jax.jit(jax.vmap(one))(*given)
+    for i in range(3):
+        for a, b in zip(together, one(*(v[i] for v in given)), strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=0, atol=1e-13)
+
+
+def test_what_knows_no_time_refuses_it_by_name():
+    with pytest.raises(ValueError, match="press knows no time.*press_in_time"):
+        press(TUBE, QUINTIC, 22.0, 1.0, UNIFORM)
+    with pytest.raises(ValueError, match="relaxation is 'off'"):
+        run(QUINTIC, Relaxation(TWO), Options())
+    with pytest.raises(ValueError, match="'uniform', found branches of the skeleton"):
+        run(QUINTIC, Relaxation(TWO, TWO), UNIFORM)
+    with pytest.raises(ValueError, match="'parts', found no branches"):
+        run(QUINTIC, Relaxation(TWO), PARTS)
+    with pytest.raises(ValueError, match="coupling='series'"):
+        Options(relaxation="parts", coupling="total")
+    with pytest.raises(ValueError, match="not derived for skeleton='sections'"):
+        Options(relaxation="parts", skeleton="sections", contact="bonded")
+    with pytest.raises(ValueError, match="shortest"):
+        Options(relaxation="uniform", shortest=2.0, longest=1.0)
+    with pytest.raises(ValueError, match="time"):
+        run(QUINTIC, Relaxation(TWO), UNIFORM, TIMES[1:])
+
+
+def test_numbers_of_the_skeleton_end_in_its_name():
+    values = {name: jnp.asarray(1.0 + i) for i, name in enumerate(names("prony-1", parts=True))}
+    assert list(values) == ["gamma_1", "tau_1", "gamma_1_skeleton", "tau_1_skeleton"]
+    found = relaxation("prony-1", values, Span(0.1, 1), parts=True)
+    assert [float(v[0]) for v in jax.tree.leaves(found)] == [1, 2, 3, 4]
+    assert relaxation("prony-1", values, Span(0.1, 1)).skeleton is None

@@ -11,13 +11,17 @@ from jax.test_util import check_grads
 from late import late
 from scipy.special import exp1
 
+from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.relaxation import (
     Branches,
-    _in_parallel,
+    _bonded_in_parallel,
     fading,
+    mean_kept,
+    overloads,
     relax,
     relax_with_derivatives,
 )
+from jaxtrachea.mechanics.relaxation_energy import energy
 from jaxtrachea.mechanics.relaxation_laws import LAWS, Span, branches
 
 TWO = np.array([0.9, 0.5]), np.array([0.36, 4.3])
@@ -140,9 +144,8 @@ def test_a_bonded_contact_is_linear_and_the_same_in_parallel():
     t, elastic = journey()
     found = run(t, elastic, *two(), unilateral=False)
     x, lost = fading(t, two())
-    np.testing.assert_allclose(
-        _in_parallel(x, lost, elastic, two().gamma), found.force, rtol=0, atol=1e-14
-    )
+    parallel = _bonded_in_parallel(x, lost, elastic, two().gamma)
+    np.testing.assert_allclose(parallel, found.force, rtol=0, atol=1e-14)
     assert found.force.min() < -0.5
     vectors = jnp.stack([elastic, 2 * elastic, -elastic], axis=-1)
     together = run(t, vectors, *two(), unilateral=False)
@@ -230,6 +233,53 @@ def test_directions_chain_a_law_of_few_numbers_to_its_branches():
     _, by = relax_with_derivatives(t, elastic, elastic[None], made, along=along)
     expected = jax.jacfwd(lambda v: relax(t, elastic, of(v)).force)(given)
     np.testing.assert_allclose(by.force[1:], expected.T, rtol=0, atol=1e-12)
+
+
+def test_no_path_gives_more_work_than_was_put_in():
+    """1,000 random paths, laws and branches with lift-off; the work is integrated here.
+
+    Within a step the elastic force is linear in time and each branch a known exponential.
+    """
+    rng = np.random.default_rng(8)
+    n, steps = 1000, 80
+    knots = np.cumsum(rng.uniform(0.1, 1, (n, 9)), axis=1)
+    heights = rng.uniform(-1, 3, (n, 9)) * 10 ** rng.uniform(-1, 1, (n, 1))
+    t = np.stack([np.linspace(0, k[-1], steps) for k in knots])
+    tool = np.stack([np.interp(v, *given) for v, *given in zip(t, knots, heights, strict=True)])
+    gamma, tau = 10 ** rng.uniform(-2, 1, (n, 2)), 10 ** rng.uniform(-0.9, 2, (n, 2))
+    c, k = 10 ** rng.uniform(-1, 1, n), 10 ** rng.uniform(-2, 1, (n, 3))
+    k[:, 1:] *= rng.random((n, 2)) < 0.7
+
+    def one(t, tool, gamma, tau, c, k):
+        law, made = Law(k[0], k[1], k[2]), Branches(gamma, tau)
+        found = relax(t, tool, made)
+        e, h = found.elastic, overloads(t, found.elastic, made)
+        e_0, h_0 = (jnp.concatenate([jnp.zeros_like(v[:1]), v[:-1]]) for v in (e, h))
+        dt = jnp.diff(t, prepend=t[:1])
+        d = law.root(e, jnp.ones_like(e), 0.0)
+        d_0, moved = jnp.append(0, d[:-1]), jnp.where(e == e_0, 1, e - e_0)
+        work = jnp.zeros_like(e)
+        for place, weight in zip(*np.polynomial.legendre.leggauss(12), strict=True):
+            depth = d_0 + (1 + place) / 2 * (d - d_0)  # smooth in it, however steep the law
+            now = law.force(depth)
+            lapsed = ((now - e_0) / moved * dt)[:, None] / tau[None]
+            carried = gamma[None] * mean_kept(lapsed) * (now - e_0)[:, None]
+            force = now + jnp.sum(jnp.exp(-lapsed) * h_0 + carried, axis=-1)
+            work = work + weight / 2 * force * (1 + c * law.tangent(depth)) * (d - d_0)
+        return jnp.cumsum(work), found.force, energy(t, e, made, law, c)
+
+    given = [jnp.asarray(v) for v in (t, tool, gamma, tau, c, k)]
+    work, force, (stored, dissipated) = jax.jit(jax.vmap(one))(*given)
+    peak = np.maximum(np.abs(work), np.abs(stored)).max(1, keepdims=True)
+    assert np.mean(np.any(force[:, 1:] == 0, axis=1)) > 0.7
+    taken = np.asarray(work - stored)
+    assert (taken / peak).min() > -1e-9
+    assert (np.diff(taken, axis=1) / peak).min() > -1e-9
+    assert np.asarray(stored / peak).min() > -1e-12
+    assert np.asarray(jnp.diff(dissipated, axis=1)).min() >= 0
+    off = np.abs((taken - dissipated) / peak).max(1)  # of places in time, which a steep law sees
+    assert np.median(off) < 1e-9
+    assert off.max() < 1e-3
 
 
 def reduced(t, made):

@@ -4,7 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import ArrayLike, real, shaped
 from jaxtrachea._numerics import scaled
@@ -13,7 +13,6 @@ from jaxtrachea.mechanics.admission import (
     admit,
     check_place,
     float_type,
-    has_solution,
     hide,
     status_of,
 )
@@ -23,6 +22,7 @@ from jaxtrachea.mechanics.levels.options import Options, check_line
 from jaxtrachea.mechanics.press import Press
 from jaxtrachea.mechanics.relaxation import Relaxation, relax
 from jaxtrachea.mechanics.relaxation_parts import relax_parts
+from jaxtrachea.mechanics.samples import as_before, in_order, no_history
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -116,12 +116,11 @@ def _press_in_time(
     contact = _press.Contact(law, onset, blend, softening)
     elastic = _press.respond(displacement, unit.w_C, contact, options)
     moved = _press.touch(displacement, onset, options, blend)
-    known = jnp.isfinite(displacement)
-    time, back = in_order(time, known)
+    time, order = in_order(time, displacement)
     relaxation, refused = _validated(relaxation, refused)
-    solved = _in_time(time, moved, back | ~known, unit.w_C, law, relaxation, elastic, options)
-    status = jnp.where(back, PressStatus.BACK_IN_TIME, solved.status)
-    status = jnp.where(known | back, status, PressStatus.NON_FINITE)
+    skipped = order != PressStatus.OK
+    solved = _in_time(time, moved, skipped, unit.w_C, law, relaxation, elastic, options)
+    status = jnp.where(skipped, order, solved.status)
     if softening is not None:
         ratio = softening.ratio(jnp.where(jnp.isfinite(solved.force), moved, 0))
         solved = solved._replace(force=ratio * solved.force)
@@ -153,22 +152,6 @@ def _validated(relaxation: Relaxation, refused):
     return safe, jnp.where(refused != PressStatus.OK, refused, why).astype(jnp.int8)
 
 
-def in_order(
-    time: Float[Array, " N"], known: Bool[Array, " N"]
-) -> tuple[Float[Array, " N"], Bool[Array, " N"]]:
-    """Times that never fall, and which samples are before an earlier one or at no time.
-
-    Those, and samples that are not `known`, are at the time of the last one before that counts.
-    """
-    timed = jnp.isfinite(time)
-    counts = timed & known
-    latest = jax.lax.cummax(jnp.where(counts, time, -jnp.inf))
-    back = ~timed | (time < latest)
-    start = jnp.min(jnp.where(counts, time, jnp.inf))  # of samples before the first that counts
-    latest = jnp.maximum(latest, jnp.where(jnp.isfinite(start), start, 0))
-    return jnp.where(back | ~known, jax.lax.stop_gradient(latest), time), back
-
-
 def _in_time(
     time,
     moved,
@@ -181,44 +164,27 @@ def _in_time(
 ) -> Equilibrium:
     """The press of small strain in time; `load` is the elastic force of the skeleton."""
     load = elastic.force if elastic.load is None else elastic.load
-    failed = ~has_solution(elastic.status)
-    # The tool stays where it was.
-    moved, load, failed = (_as_before(v, skipped) for v in (moved, load, failed))
-    lost = jnp.cumsum(failed) > 0
+    lost, _ = no_history(elastic.status, skipped)
+    # Where it is skipped the tool stays where it was; what is lost changes nothing before it.
+    moved, load = (as_before(jnp.where(lost, 0, v), skipped) for v in (moved, load))
     unilateral = options.contact == "unilateral"
-    safe = jnp.where(lost, 0, moved)
+    folded = None
     if relaxation.skeleton is None:
-        force, surface = relax(time, jnp.where(lost, 0, load), relaxation.local, unilateral)
-        depth = safe - compliance * surface
+        force, surface = relax(time, load, relaxation.local, unilateral)
+        depth = moved - compliance * surface
         if unilateral:
-            left = surface != jnp.where(lost, 0, load)
+            left = surface != load
             alone = law.root(jnp.where(left, surface, 0), jnp.ones_like(surface), 0.0)
             depth = jnp.where(left, alone, depth)
     else:
         branches = relaxation.local, relaxation.skeleton
-        found = relax_parts(time, safe, compliance, law, *branches, unilateral)
-        force, depth, surface = found.force, found.depth, found.load
-        failed, lost = failed | found.folded, lost | (jnp.cumsum(found.folded) > 0)
-    status = _status(elastic.status, force, failed, lost, unilateral)
-    hidden = lost | skipped
-    force, depth, surface = (jnp.where(hidden, jnp.nan, v) for v in (force, depth, surface))
-    return Equilibrium(depth, force, status, surface)
-
-
-def _as_before(v, skipped):
-    """Each entry that is skipped as the last one before that is not; 0 without such a one."""
-    place = jnp.arange(v.shape[0])
-    last = jax.lax.cummax(jnp.where(skipped, -1, place))
-    return jnp.where(last >= 0, v[jnp.maximum(last, 0)], jnp.zeros_like(v))
-
-
-def _status(status, force, failed, lost, unilateral: bool) -> Int[Array, " N"]:
-    """Of samples in contact OK, off it NO_CONTACT; after the first that failed the reason of it."""
-    first = jnp.argmax(failed)
-    why = jnp.where(
-        has_solution(status[first]), jnp.asarray(PressStatus.PAST_FOLD, jnp.int8), status[first]
-    )
+        force, depth, surface, folded = relax_parts(
+            time, moved, compliance, law, *branches, unilateral
+        )
+    lost, status = no_history(elastic.status, skipped, folded)
     touches = force > 0 if unilateral else force != 0
+    told = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
     plain = jnp.where(touches, PressStatus.OK, PressStatus.NO_CONTACT)
-    plain = jnp.where(status == PressStatus.NEGATIVE_LOCAL, status, plain)
-    return jnp.where(lost, why, plain).astype(jnp.int8)
+    status = jnp.where(told, plain, status).astype(jnp.int8)
+    force, depth, surface = (jnp.where(lost | skipped, jnp.nan, v) for v in (force, depth, surface))
+    return Equilibrium(depth, force, status, surface)

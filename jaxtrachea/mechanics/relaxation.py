@@ -120,7 +120,9 @@ def relax(
         return lambda: loop(x, lost, elastic, branches.gamma)
 
     # The loop is one kernel on a CPU; elsewhere each of its rounds would be several.
-    force = jax.lax.platform_dependent(cpu=bonded(_bonded_filter), default=bonded(_in_parallel))
+    force = jax.lax.platform_dependent(
+        cpu=bonded(_bonded_filter), default=bonded(_bonded_in_parallel)
+    )
     return Relaxed(force, elastic)
 
 
@@ -279,16 +281,31 @@ def _bonded_loop(x, lost, elastic, gamma):
     return _loop(x, lost, elastic, gamma, False)[0]
 
 
+def overloads(
+    time: Float[Array, " N"], elastic: Float[Array, " N"], branches: Branches
+) -> Float[Array, "N B"]:
+    """What each branch carries, N, of the elastic force of the surface (`Relaxed.elastic`)."""
+    x, lost = fading(time, branches)
+    return _in_parallel(x, lost, elastic, branches.gamma)
+
+
 def _in_parallel(x, lost, elastic, gamma):
-    """`_bonded_loop` by an associative scan: what no sample lets go is linear in all of them."""
-    share = gamma[None] * _mean(x, lost)
-    pushed = share * jnp.diff(elastic, prepend=0)[:, None]
+    """`overloads` by an associative scan: it is linear in all samples."""
+    pushed = gamma[None] * _mean(x, lost) * jnp.diff(elastic, prepend=0)[:, None]
 
     def after(first, then):
         return first[0] * then[0], then[0] * first[1] + then[1]
 
-    h = jax.lax.associative_scan(after, (1 + lost, pushed))[1]
-    return elastic + jnp.sum(h, axis=-1)
+    return jax.lax.associative_scan(after, (1 + lost, pushed))[1]
+
+
+def _bonded_in_parallel(x, lost, elastic, gamma):
+    return elastic + jnp.sum(_in_parallel(x, lost, elastic, gamma), axis=-1)
+
+
+def mean_kept(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """(1 - exp(-x)) / x for x >= 0, the mean of what is kept within a step."""
+    return _mean(x, _lost(x))
 
 
 def _loop_with_derivatives(

@@ -19,7 +19,7 @@ Scale = Literal["log", "linear"]
 Part = Literal["skeleton", "contact", "finite strain", "sections", "time", "press"]
 Needs = Literal[
     "", "shear", "two-material", "softening", "axial", "arch", "second plane", "sections",
-    "arch, sections", "relaxation",
+    "arch, sections", "relaxation", "parts",
 ]  # fmt: skip
 Each = Literal["", "span", "ring"]
 
@@ -71,9 +71,9 @@ class Declaration:
         description: what the user reads in tables.
         part: `skeleton` (it changes the compliance under the contact), `contact` (the local law),
             `finite strain` (how the skeleton leaves that compliance in deep presses), `sections`
-            (of a skeleton of deforming cross-sections, in `SectionMaterial`), `time` (how the force
-            relaxes, beside a material of any kind) or `press` (of a single press: no property of
-            the specimen, not in `Material`).
+            (of a skeleton of deforming cross-sections, in `SectionMaterial`), `time` (how its force
+            relaxes, in no record of a material: any level may) or `press` (of a single press: no
+            property of the specimen, not in `Material`).
         symbol: in the paper.
         needs: option or effect that reads it; "" where every press does. A fit has it in its model
             where `mechanics.press.Options` has that option.
@@ -271,51 +271,67 @@ _OF_THE_PRESS = (
 )  # fmt: skip
 
 
-def _strength(name: str, what: str) -> Declaration:
-    return Declaration(
-        name, "1", "dimensionless", what, part="time", needs="relaxation",
-        fit=Fitted(0.5, 1e-4, 1e3),
+def _of_time(suffix: str, whose: str, needs: Needs) -> list[Declaration]:
+    """The numbers of all laws of relaxation, see `mechanics.relaxation_laws`."""
+    rest = {"part": "time", "needs": needs, "absent": "no relaxation"}
+    strength = Fitted(0.5, 1e-6, 1e6)
+    rows = [
+        Declaration(
+            f"gamma_{b}{suffix}", "1", "dimensionless",
+            f"strength of branch {b} of {whose} (prony), over what lasts", fit=strength, **rest,
+        )
+        for b in range(1, 5)
+    ]  # fmt: skip
+    rows.append(
+        Declaration(
+            f"tau_1{suffix}", "s", "time",
+            f"shortest relaxation time of {whose} (prony, fung)",
+            fit=Fitted(1.0, 1e-6, 1e6), **rest,
+        )
     )  # fmt: skip
-
-
-def _duration(name: str, what: str, value: float) -> Declaration:
-    return Declaration(
-        name, "s", "time", what, part="time", needs="relaxation", fit=Fitted(value, 1e-9, 1e9)
-    )
-
-
-def _ratio(name: str, what: str, fit: Fitted) -> Declaration:
-    return Declaration(name, "1", "dimensionless", what, part="time", needs="relaxation", fit=fit)
-
-
-#: How a force relaxes: numbers of the laws of `mechanics.relaxation_laws`.
-_OF_TIME = (
-    *(_strength(f"gamma_{b}", f"strength of branch {b} over what lasts") for b in range(1, 5)),
-    _strength("gamma", "strength after 1 s over what lasts"),
-    _strength("C", "strength a natural logarithm of time"),
-    _duration("tau_1", "shortest relaxation time", 1.0),
-    *(
-        _ratio(f"tau_ratio_{b}", f"relaxation time {b} over that before", Fitted(10.0, 2.0, 1e9))
+    rows += [
+        Declaration(
+            f"tau_ratio_{b}{suffix}", "1", "dimensionless",
+            f"relaxation time of branch {b} of {whose} over the one before (prony)",
+            fit=Fitted(10.0, 2.0, 1e6), **rest,
+        )
         for b in range(2, 5)
-    ),
-    _duration("tau_2", "longest relaxation time", 100.0),
-    _ratio("beta", "exponent of the relaxation", Fitted(0.15, 0.05, 0.4)),
+    ]  # fmt: skip
+    return rows + [
+        Declaration(
+            f"gamma{suffix}", "1", "dimensionless",
+            f"strength of {whose} after 1 s (power), over what lasts", fit=strength, **rest,
+        ),
+        Declaration(
+            f"beta{suffix}", "1", "dimensionless", f"exponent of {whose} (power)",
+            fit=Fitted(0.2, 0.05, 0.4), **rest,
+        ),
+        Declaration(
+            f"C{suffix}", "1", "dimensionless",
+            f"strength of {whose} for each e-fold of time (fung), over what lasts",
+            fit=Fitted(0.1, 1e-6, 1e6), **rest,
+        ),
+        Declaration(
+            f"tau_2{suffix}", "s", "time", f"longest relaxation time of {whose} (fung)",
+            fit=Fitted(100.0, 1e-6, 1e9), **rest,
+        ),
+    ]  # fmt: skip
+
+
+_OF_TIME = _of_time("", "the relaxation", "relaxation") + _of_time(
+    "_skeleton", "the skeleton's relaxation", "parts"
 )
 #: Values of a material by name, in the order of every table.
 VALUES: dict[str, Declaration] = {
     field.name: field.metadata["declaration"] for field in dataclasses.fields(Material)
 }
-#: Those of relaxation.
-OF_TIME: dict[str, Declaration] = {
-    name: dataclasses.replace(p, name=name, description=p.description + what)
-    for suffix, what in (("", ""), ("_skeleton", ", of the skeleton apart"))
-    for p in _OF_TIME
-    for name in (p.name + suffix,)
-}
+#: Numbers of the relaxation, likewise; where the skeleton relaxes apart the others are of the local
+#: law alone.
+OF_TIME: dict[str, Declaration] = {p.name: p for p in _OF_TIME}
 #: Those of single presses.
 OF_PRESS: dict[str, Declaration] = {p.name: p for p in _OF_THE_PRESS}
 #: Every parameter of a line of joints, likewise; those of single presses last.
-PARAMETERS: dict[str, Declaration] = VALUES | OF_TIME | OF_PRESS
+PARAMETERS: dict[str, Declaration] = VALUES | OF_PRESS
 #: Values of a skeleton that softens in deep presses.
 DEEP = tuple(name for name, p in VALUES.items() if p.needs == "softening")
 

@@ -1,6 +1,5 @@
 """The two doors: the level that options ask for, and its kind where a material alone is there."""
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Mapping
@@ -27,10 +26,8 @@ DECLARED: Mapping[str, Declaration] = functools.reduce(
 @functools.lru_cache(maxsize=256)
 def level_of(options: Options) -> Level:
     """The level that options ask for; equal where they are."""
-    if options.relaxation == "off":
-        return LEVELS[options.skeleton](options)
-    elastic = LEVELS[options.skeleton](dataclasses.replace(options, relaxation="off"))
-    return Relaxing(elastic, options)
+    level = LEVELS[options.skeleton](options)
+    return level if options.relaxation == "off" else Relaxing(level, options)
 
 
 def level_type(material: AnyMaterial) -> type[Level]:

@@ -8,12 +8,15 @@ import abc
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Contact
-from jaxtrachea.mechanics.relaxation import Relaxation
+from jaxtrachea.mechanics.relaxation import Relaxation, relax
+from jaxtrachea.mechanics.samples import as_before, in_order, no_history
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Declaration
 
@@ -28,7 +31,7 @@ class Motion(NamedTuple):
         blend: rounded corner of a curve whose onset was fitted, mm; None: that of the options.
         phi_c: contact angle, rad; None, as `direction`: on the midline, along the normal.
         direction: of the tool, along the inward normal and the circumference.
-        time: of every displacement, s, never falling; None: the level has no time.
+        time: of every displacement, s; None: no level that relaxes.
     """
 
     s_c: Float[Array, ""]
@@ -256,3 +259,29 @@ class Level(abc.ABC):
     @abc.abstractmethod
     def response(self, tube: Geometry, material: Any, motion: Motion) -> Response:
         """Press; pure, of one example."""
+
+    def relaxed(
+        self, tube: Geometry, material: Any, motion: Motion, relaxation: Relaxation
+    ) -> Response:
+        """Press in time: what `levels.relaxing` wraps.
+
+        Of a tool that sticks to the wall; all of the organ relaxes alike, in its elastic shape.
+        """
+        assert motion.time is not None
+        time, order = in_order(motion.time, motion.displacement)
+        found = self.response(tube, material, motion)
+        skipped, status = order != PressStatus.OK, found.status
+        lost, status = no_history(status, skipped)
+        hidden = lost | skipped
+
+        def filtered(force):
+            if force is None:
+                return None
+            safe = as_before(jnp.where(lost, 0, force), skipped)
+            relaxed = relax(time, safe, relaxation.local, unilateral=False).force
+            return jnp.where(hidden, jnp.nan, relaxed)
+
+        return found._replace(
+            force=filtered(found.force), side_force=filtered(found.side_force),
+            status=jnp.where(skipped, order, status).astype(jnp.int8),
+        )  # fmt: skip

@@ -14,6 +14,8 @@ from jaxtrachea.mechanics.admission import check_shapes, without_negative
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.press_in_time import press_in_time
+from jaxtrachea.mechanics.relaxation import Relaxation
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import DEEP, OF_PRESS, VALUES, Material, material_of
 
@@ -142,6 +144,16 @@ class Line(Level):
         """1 in the place of negative values; others that the options do not read stay."""
         read = _press.read_values(self.options)
         return without_negative(material, dict.fromkeys((*read, *also)))
+
+    def relaxed(
+        self, tube: Geometry, material: Material, motion: Motion, relaxation: Relaxation
+    ) -> Response:
+        """See `press_in_time`: a unilateral contact lets go."""
+        found = press_in_time(
+            tube, material, motion.s_c, motion.time, motion.displacement, relaxation, self.options,
+            onset=motion.onset, blend=motion.blend,
+        )  # fmt: skip
+        return Response(found.force, found.joints, found.status, reactions=found.reactions)
 
     def skeleton(
         self, tube: Geometry, material: Material, s_c: Float[Array, "*m"], *, joints: bool

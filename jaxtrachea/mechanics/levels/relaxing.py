@@ -1,144 +1,132 @@
-"""A level whose force relaxes: any other level, and a filter of its force by the time.
-
-If all parts of the organ relax alike, its shape is the elastic one at every instant and the force
-is that of `mechanics.relaxation`. Parameters of the level within are those that last.
-"""
+"""A level whose force relaxes in time: it wraps any other."""
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.mechanics.admission import has_solution
+from jaxtrachea.mechanics import relaxation_laws
 from jaxtrachea.mechanics.levels.level import Closed, Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.press_in_time import press_in_time
-from jaxtrachea.mechanics.relaxation import Relaxation, relax
-from jaxtrachea.mechanics.relaxation_laws import names, relaxation
-from jaxtrachea.status import PressStatus
+from jaxtrachea.mechanics.relaxation import Relaxation
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_TIME
 
 
-class Lasting(NamedTuple):
-    """Values of a level that relaxes: of the level within, which last, and what relaxes."""
+class Timed(NamedTuple):
+    """Values of a level within, in the long run, and what relaxes."""
 
-    elastic: Any
+    material: Any
     relaxation: Relaxation
 
 
-def _of_within(name: str) -> Any:
-    """An attribute that the level within has."""
-    return property(lambda self: getattr(self.within, name))
+def _of_inner(name: str) -> Any:
+    return property(lambda self: getattr(self.inner, name))
 
 
 @dataclasses.dataclass(frozen=True)
 class Relaxing(Level):
-    """A level whose force relaxes.
+    """The level within, its values those of the long run; see `mechanics.relaxation`.
 
     Attributes:
-        within: the elastic level.
-        options: that asked for it.
+        inner: the level within.
+        options: how it relaxes, and by which law.
     """
 
-    within: Level
+    inner: Level
     options: Options
-
-    observes = _of_within("observes")
-    material_type = _of_within("material_type")
-    iterates = _of_within("iterates")
-    roundings = _of_within("roundings")
-    reads_wall = _of_within("reads_wall")
-    follows_axial = _of_within("follows_axial")
-    hangs_on_rings = _of_within("hangs_on_rings")
-    hides_refused = _of_within("hides_refused")
-    stepwise = _of_within("stepwise")
-    name = _of_within("name")
-    tested = _of_within("tested")
-    tested_angle = _of_within("tested_angle")
-    deepest = _of_within("deepest")
-    wall_radius = _of_within("wall_radius")
-    thickness = _of_within("thickness")
-    check = _of_within("check")
-    without_negative = _of_within("without_negative")
+    stepwise: ClassVar = False
+    material_type = _of_inner("material_type")
+    observes = _of_inner("observes")
+    iterates = _of_inner("iterates")
+    roundings = _of_inner("roundings")
+    reads_wall = _of_inner("reads_wall")
+    follows_axial = _of_inner("follows_axial")
+    hangs_on_rings = _of_inner("hangs_on_rings")
+    hides_refused = _of_inner("hides_refused")
+    name = _of_inner("name")
+    tested = _of_inner("tested")
+    thickness = _of_inner("thickness")
+    check = _of_inner("check")
+    without_negative = _of_inner("without_negative")
 
     @property
-    def declares(self) -> Any:
-        """With the strengths and times of the branches."""
-        return {**self.within.declares, **OF_TIME}
+    def declares(self):
+        """Those of the level within, and the numbers of the law."""
+        return self.inner.declares | {name: OF_TIME[name] for name in self.of_time}
+
+    @property
+    def of_time(self) -> tuple[str, ...]:
+        """Names of the numbers of the law."""
+        o = self.options
+        return relaxation_laws.names(o.branches, parts=o.relaxation == "parts")
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What relaxes, and the law."""
+        return (*self.inner.parts, f"relaxing ({self.options.relaxation}, {self.options.branches})")
+
+    def tested_angle(self, half_angle: float) -> float:
+        """As the level within."""
+        return self.inner.tested_angle(half_angle)
+
+    def deepest(self, radius: float) -> float:
+        """As the level within."""
+        return self.inner.deepest(radius)
+
+    def wall_radius(self, tube: Geometry, outer: Any) -> Any:
+        """As the level within."""
+        return self.inner.wall_radius(tube, outer)
+
+    def needs(self, *, joints: bool) -> frozenset[str]:
+        """What the level within needs, and the numbers of the law."""
+        return self.inner.needs(joints=joints) | frozenset(self.of_time)
+
+    def admits(self, curve: Record, size: Size, onset: float = 0.0) -> InputError | None:
+        """A curve with its time, that the level within presses."""
+        if curve.time is None:
+            return InputError(
+                "it has no time, and a force that relaxes follows from it",
+                cure="name its column ([data] columns, time = ...) and take loading = 'record', or "
+                "relaxation = 'off'",
+            )
+        if np.any(np.diff(curve.time) < 0) or not curve.time[-1] > curve.time[0]:
+            return InputError(
+                "its time does not run from the first sample to the last",
+                cure="take loading = 'record', or relaxation = 'off'",
+            )
+        return self.inner.admits(curve, size, onset)
 
     @property
     def closed(self) -> Closed | None:
-        """Of the elastic level."""
-        return self.within.closed
+        """Of the level within, elastic."""
+        elastic = dataclasses.replace(self.options, relaxation="off")
+        return dataclasses.replace(self.inner, options=elastic).closed  # type: ignore[call-arg]
 
     @property
     def forward(self) -> bool:
         """Where parts relax apart, every sample is an equilibrium with a past."""
-        return self.options.relaxation == "parts" or self.within.forward
+        return self.options.relaxation == "parts" or self.inner.forward
 
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """And the law of relaxation."""
-        return (*self.within.parts, f"relaxing ({self.options.branches})")
-
-    def needs(self, *, joints: bool) -> frozenset[str]:
-        """And the numbers of the law."""
-        return self.within.needs(joints=joints) | frozenset(self.numbers)
-
-    @property
-    def numbers(self) -> tuple[str, ...]:
-        """Names of the numbers of its relaxation."""
-        return names(self.options.branches, parts=self.options.relaxation == "parts")
-
-    def admits(self, curve: Record, size: Size, onset: float = 0.0) -> InputError | None:
-        """As the level within, and by a time that runs."""
-        cure = (
-            "name its column ([data] columns, time = ...) and take loading = 'record', or "
-            "relaxation = 'off'"
-        )
-        if curve.time is None:
-            return InputError("no time, which a force that relaxes is a function of", cure=cure)
-        if np.any(np.diff(curve.time) < 0) or not curve.time[-1] > curve.time[0]:
-            return InputError("its time does not run from the first sample to the last", cure=cure)
-        return self.within.admits(curve, size, onset)
-
-    def material(self, values: Mapping[str, Array]) -> Lasting:
-        """Values by name."""
-        return Lasting(self.within.material(values), self.relaxation(values))
+    def material(self, values: Mapping[str, Array]) -> Timed:
+        """Values of the level within, and the branches."""
+        return Timed(self.inner.material(values), self.relaxation(values))
 
     def relaxation(self, values: Mapping[str, Array]) -> Relaxation:
         """See `relaxation_laws.relaxation`."""
-        word, parts = self.options.branches, self.options.relaxation == "parts"
-        return relaxation(word, values, self.options.span, parts=parts)
+        o = self.options
+        parts = o.relaxation == "parts"
+        return relaxation_laws.relaxation(o.branches, values, o.span, parts=parts)
 
-    def response(self, tube: Geometry, material: Lasting, motion: Motion) -> Response:
-        """Of a line `press_in_time`, else the elastic force of the level within, which relaxes.
+    def response(self, tube: Geometry, material: Timed, motion: Motion) -> Response:
+        """Press in time.
 
         Raises:
-            ValueError: no time.
+            ValueError: a motion without time.
         """
         if motion.time is None:
-            raise ValueError("motion.time is None; a force that relaxes needs the time")
-        if self.within.closed is not None:
-            found = press_in_time(
-                tube, material.elastic, motion.s_c, motion.time, motion.displacement,
-                material.relaxation, self.options, onset=motion.onset, blend=motion.blend,
-            )  # fmt: skip
-            return Response(found.force, found.joints, found.status, reactions=found.reactions)
-        found, local = (
-            self.within.response(tube, material.elastic, motion),
-            material.relaxation.local,
-        )
-        unilateral = self.options.contact == "unilateral"
-        force = relax(motion.time, found.force, local, unilateral).force
-        side = found.side_force
-        if side is not None:
-            side = relax(motion.time, side, local, False).force
-        lost = has_solution(found.status) & ~jnp.isfinite(force)  # after one without a solution
-        status = jnp.where(lost, PressStatus.NON_FINITE, found.status).astype(found.status.dtype)
-        return found._replace(force=force, side_force=side, status=status)
+            raise ValueError("the motion has no time, and options.relaxation is not 'off'")
+        return self.inner.relaxed(tube, material.material, motion, material.relaxation)
