@@ -22,6 +22,7 @@ from .mechanics.bound import bind as bind
 from .mechanics.force_law import Law as Law
 from .mechanics.force_law import duffing as duffing
 from .mechanics.friction import Coulomb as Coulomb
+from .mechanics.levels.level import Motion as Motion
 from .mechanics.oblique import ObliqueOptions as ObliqueOptions
 from .mechanics.oblique import ObliquePath as ObliquePath
 from .mechanics.oblique import ObliquePress as ObliquePress
@@ -31,12 +32,12 @@ from .mechanics.press import Options as Options
 from .mechanics.press import Press as Press
 from .mechanics.press import press as press
 from .mechanics.press_in_time import press_in_time as press_in_time
-from .mechanics.relaxation import Branches as Branches
-from .mechanics.relaxation import Relaxation as Relaxation
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
 from .prediction.predict import CurvePrediction as CurvePrediction
 from .prediction.predict import predict as predict
+from .relaxation.filter import Relaxation as Relaxation
+from .relaxation.steps import Branches as Branches
 from .results.read import NoResults as NoResults
 from .results.read import read_results as read_results
 from .scene.assemble import make_scene as make_scene

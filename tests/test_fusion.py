@@ -356,6 +356,21 @@ def test_nothing_traced_is_kept():
     )
 
 
+def test_a_loop_that_reads_slices_is_one_kernel_whatever_it_reads():
+    """More entries than are small, a row a round: only where it is said."""
+
+    def summed(rows):
+        return jax.lax.scan(lambda s, row: (s + row, s * row), jnp.zeros_like(rows[0]), rows)[1]
+
+    rows = jnp.linspace(0, 1, 400 * 200).reshape(400, 200)
+    assert rows.size > fusion.SMALL
+    marked = fuse(summed, streams=True)
+    np.testing.assert_allclose(jax.jit(marked)(rows), summed(rows), rtol=1e-14)
+    if fusion._one_kernel_p is not None:
+        assert ONE in compiled(marked, rows)
+        assert ONE not in compiled(fuse(summed), rows)
+
+
 UNFIT = {
     "product": lambda x, y: jnp.outer(x, x) @ y,
     "places": lambda x, y: x.at[jnp.array([0, 2])].set(y[:2]),

@@ -19,11 +19,11 @@ from jaxtrachea.fitting.parameters import DECLARED, DEFAULTS, in_model
 from jaxtrachea.fitting.residual import of_press, of_trials, residual
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.mechanics import relaxation_laws
 from jaxtrachea.mechanics.levels.choose import LEVELS, level_of
 from jaxtrachea.mechanics.levels.level import Level, Motion, Response, Size
 from jaxtrachea.mechanics.levels.options import Options, Skeleton
 from jaxtrachea.mechanics.levels.relaxing import Relaxing
+from jaxtrachea.relaxation import laws as relaxation_laws
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 

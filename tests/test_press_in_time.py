@@ -10,10 +10,12 @@ import pytest
 from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.press_in_time import press_in_time
-from jaxtrachea.mechanics.relaxation import Branches, Relaxation
-from jaxtrachea.mechanics.relaxation_laws import Span, names, relaxation
+from jaxtrachea.relaxation.filter import Relaxation
+from jaxtrachea.relaxation.laws import Span, names, relaxation
+from jaxtrachea.relaxation.steps import Branches
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -30,7 +32,7 @@ WAY = np.interp(TIMES, [0, 1, 6, 7, 9, 10], [0, 4, 4, 0.2, 0.2, 3])
 
 @functools.partial(jax.jit, static_argnames="options")
 def run(material, relaxes, options, time=TIMES, way=WAY, s_c=22.0):
-    return press_in_time(TUBE, material, s_c, time, way, relaxes, options)
+    return press_in_time(TUBE, material, Motion(s_c, way, time=time), relaxes, options)
 
 
 @pytest.mark.parametrize(
@@ -214,8 +216,13 @@ def test_what_knows_no_time_refuses_it_by_name():
         Options(relaxation="parts", skeleton="sections", contact="bonded")
     with pytest.raises(ValueError, match="shortest"):
         Options(relaxation="uniform", shortest=2.0, longest=1.0)
-    with pytest.raises(ValueError, match="time"):
+    with pytest.raises(ValueError, match="time has"):
         run(QUINTIC, Relaxation(TWO), UNIFORM, TIMES[1:])
+    for motion, words in (
+        (Motion(22.0, WAY), "no time"), (Motion(22.0, WAY, phi_c=0.1, time=TIMES), "midline"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            press_in_time(TUBE, QUINTIC, motion, Relaxation(TWO), UNIFORM)
 
 
 def test_numbers_of_the_skeleton_end_in_its_name():

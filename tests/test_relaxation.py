@@ -12,17 +12,10 @@ from late import late
 from scipy.special import exp1
 
 from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.relaxation import (
-    Branches,
-    _bonded_in_parallel,
-    fading,
-    mean_kept,
-    overloads,
-    relax,
-    relax_with_derivatives,
-)
 from jaxtrachea.mechanics.relaxation_energy import energy
-from jaxtrachea.mechanics.relaxation_laws import LAWS, Span, branches
+from jaxtrachea.relaxation.filter import overloads, relax, relax_with_derivatives
+from jaxtrachea.relaxation.laws import LAWS, Span, branches
+from jaxtrachea.relaxation.steps import Branches, bonded_in_parallel, fading, mean_kept
 
 TWO = np.array([0.9, 0.5]), np.array([0.36, 4.3])
 #: Load, hold, unload until the tool is off, wait, and load again.
@@ -144,7 +137,7 @@ def test_a_bonded_contact_is_linear_and_the_same_in_parallel():
     t, elastic = journey()
     found = run(t, elastic, *two(), unilateral=False)
     x, lost = fading(t, two())
-    parallel = _bonded_in_parallel(x, lost, elastic, two().gamma)
+    parallel = bonded_in_parallel(x, lost, elastic, two().gamma)
     np.testing.assert_allclose(parallel, found.force, rtol=0, atol=1e-14)
     assert found.force.min() < -0.5
     vectors = jnp.stack([elastic, 2 * elastic, -elastic], axis=-1)

@@ -18,6 +18,7 @@ from jaxtrachea.fitting.lane import FORCES, MARKERS, Lane
 from jaxtrachea.fitting.model import Loss
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.levels.level import Level
 from jaxtrachea.trachea.geometry import Geometry
 
 Balance = Literal["curve", "sample"]
@@ -237,8 +238,7 @@ def lanes_of(
     noise: Noise,
     weighting: Weighting,
     tool_radius: float | None,
-    vectors: bool = False,
-    time: bool = False,
+    level: Level,
 ) -> Lane:
     """The lanes of a study, stacked along a leading axis.
 
@@ -250,9 +250,9 @@ def lanes_of(
         noise: known standard deviations.
         weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
         tool_radius: see `study.build_study`.
-        vectors: see `Lane.phi_c`; whether the model reads what is below it there.
-        time: whether the model relaxes: every curve has its time.
+        level: of the model: whether it reads what is below `Lane.phi_c`, and the time.
     """
+    vectors = level.off_midline
     every = [c for curves in groups for c in curves]
     lengths = [len(c.force) for c in every]
     layout = _Layout(
@@ -266,7 +266,7 @@ def lanes_of(
         unknowns=max(map(len, unknowns)),
         joints=any(_has_motion(c, vectors=vectors) for c in every),
         vectors=vectors,
-        time=time,
+        time=level.relaxes,
         curves=every,
     )
     lanes = [_lane(layout, *lane) for lane in zip(groups, unknowns, strict=True)]

@@ -86,7 +86,7 @@ class FitModel:
     @property
     def relaxes(self) -> bool:
         """Whether the force relaxes: lanes have their time."""
-        return self.options.relaxation != "off"
+        return self.level.relaxes
 
     @property
     def geometry(self) -> Geometry:

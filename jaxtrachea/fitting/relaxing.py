@@ -1,6 +1,6 @@
 """What a fit does where the force relaxes: its press by the time, bounds and starts by the records.
 
-Equations and derivatives are those of `mechanics.relaxation`.
+Equations and derivatives are those of `relaxation.filter`.
 """
 
 import dataclasses
@@ -18,14 +18,10 @@ from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.relaxation import (
-    Branches,
-    Relaxation,
-    relax,
-    relax_with_derivatives,
-)
-from jaxtrachea.mechanics.relaxation_laws import LAWS, OF_SKELETON, Span
-from jaxtrachea.mechanics.relaxation_laws import names as names_of
+from jaxtrachea.relaxation.filter import Relaxation, relax, relax_with_derivatives
+from jaxtrachea.relaxation.laws import LAWS, OF_SKELETON, Span
+from jaxtrachea.relaxation.laws import names as names_of
+from jaxtrachea.relaxation.steps import Branches
 from jaxtrachea.trachea.material import OF_TIME
 
 #: Relaxation times are sought from this share of the shortest step to so many longest records.

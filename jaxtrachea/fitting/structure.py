@@ -30,8 +30,8 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.levels.level import Closed
 from jaxtrachea.mechanics.press import Contact
-from jaxtrachea.mechanics.relaxation_laws import names
 from jaxtrachea.mechanics.softening import Softening
+from jaxtrachea.relaxation.laws import names
 
 #: Points of the parameter box, and half its width in decades.
 POINTS, DECADES = 8, 2.0

@@ -342,8 +342,7 @@ def build_study(
     check_noise(curves, noise.force)
     own = resolved(table, curves, options, noise.force)
     parameters = natural_steps(own.parameters, curves, own.taken)
-    relaxes = options.relaxation != "off"
-    if relaxes:
+    if level_of(options).relaxes:
         span = span_of(curves)
         parameters = by_records(parameters, options, span)
         options = with_span(options, span)
@@ -354,7 +353,7 @@ def build_study(
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
         noise=noise, weighting=weighting, tool_radius=tool_radius,
-        vectors=level_of(options).off_midline, time=relaxes,
+        level=level_of(options),
     )  # fmt: skip
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)

@@ -4,9 +4,8 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from jaxtrachea._arguments import ArrayLike, real, shaped
+from jaxtrachea._arguments import real, shaped
 from jaxtrachea._numerics import scaled
 from jaxtrachea.mechanics import press as _press
 from jaxtrachea.mechanics.admission import (
@@ -18,11 +17,12 @@ from jaxtrachea.mechanics.admission import (
 )
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.levels.options import Options, check_line
 from jaxtrachea.mechanics.press import Press
-from jaxtrachea.mechanics.relaxation import Relaxation, relax
 from jaxtrachea.mechanics.relaxation_parts import relax_parts
 from jaxtrachea.mechanics.samples import as_before, in_order, no_history
+from jaxtrachea.relaxation.filter import Relaxation, relax
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -31,19 +31,14 @@ from jaxtrachea.trachea.material import Material
 def press_in_time(
     geometry: Geometry,
     material: Material,
-    s_c: ArrayLike,
-    time: ArrayLike,
-    displacement: ArrayLike,
+    motion: Motion,
     relaxation: Relaxation,
     options: Options,
-    *,
-    onset: ArrayLike | None = None,
-    blend: ArrayLike | None = None,
 ) -> Press:
     """`press.press` of a tool that moves in time, from rest before the first sample.
 
     With `options.relaxation` `uniform` all of the organ relaxes alike, so that its shape is the
-    elastic one and the force a filter of the elastic force (`mechanics.relaxation`); with `parts`
+    elastic one and the force a filter of the elastic force (`relaxation.filter`); with `parts`
     local law and skeleton relax apart (`mechanics.relaxation_parts`). The values of the material
     are those of the long run. Softening is geometry, which remembers nothing: the force of small
     strain relaxes, times the softening of the present displacement.
@@ -51,15 +46,11 @@ def press_in_time(
     Args:
         geometry: the tube at rest.
         material: stiffness values in the long run.
-        s_c: contact position, mm, as in `press`.
-        time: s; (N,). A sample before an earlier one, or at no time, is BACK_IN_TIME and NaN; all
-            others are as if it were not there.
-        displacement: of the tool along the inward normal, mm; (N,). A sample at no place is
-            NON_FINITE and NaN, and likewise passed over.
+        motion: place, time and displacement of every sample, (N,), onset and blend as in `press`;
+            numbers of any kind. A sample before an earlier one, or at no time, is BACK_IN_TIME, one
+            at no displacement NON_FINITE: NaN, and all others are as if it were not there.
         relaxation: the branches, see `relaxation_laws.relaxation`.
         options: what is modelled (static).
-        onset: tool displacement at first touch, mm; 0 if None.
-        blend: as in `press`.
 
     Returns:
         The `Press`; where the tool has left, the status is NO_CONTACT and depth, skeleton and
@@ -67,19 +58,28 @@ def press_in_time(
         the history is unknown: all later ones are NaN with its status.
 
     Raises:
-        ValueError: as `press`; options without a relaxation; branches that do not fit them.
+        ValueError: as `press`; options without a relaxation; branches that do not fit them; a
+            motion without time, or off the midline or the normal.
     """
     check_line(options, "press_in_time", timed=True)
     _check(options, relaxation)
-    displacement = real("displacement", displacement, float_type(geometry))
+    if motion.phi_c is not None or motion.direction is not None:
+        raise ValueError(
+            "press_in_time presses on the midline along the normal; leave phi_c and direction out"
+        )
+    if motion.time is None:
+        raise ValueError("the motion has no time; expected one for each displacement")
+    displacement = real("displacement", motion.displacement, float_type(geometry))
     shaped("displacement", displacement, ("any number of",))
-    time = shaped("time", time, displacement.shape, dtype=displacement.dtype)
-    onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)
-    if blend is not None:
-        blend = shaped("blend", blend, (), dtype=displacement.dtype)
-    s_c = check_place(geometry, material, s_c)
-    given = geometry, material, s_c, time, displacement, relaxation
-    return _press_in_time(*given, options, onset, blend)
+    dtype, onset, blend = displacement.dtype, motion.onset, motion.blend
+    motion = Motion(
+        s_c=check_place(geometry, material, motion.s_c),
+        displacement=displacement,
+        onset=shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype),
+        blend=None if blend is None else shaped("blend", blend, (), dtype=dtype),
+        time=shaped("time", motion.time, displacement.shape, dtype=dtype),
+    )
+    return _press_in_time(geometry, material, motion, relaxation, options)
 
 
 def _check(options: Options, relaxation: Relaxation) -> None:
@@ -97,26 +97,25 @@ def _check(options: Options, relaxation: Relaxation) -> None:
 def _press_in_time(
     geometry: Geometry,
     material: Material,
-    s_c: Float[Array, ""],
-    time: Float[Array, " N"],
-    displacement: Float[Array, " N"],
+    motion: Motion,
     relaxation: Relaxation,
     options: Options,
-    onset: Float[Array, ""],
-    blend: Float[Array, ""] | None,
 ) -> Press:
     """`press_in_time`, of arguments that are checked."""
     material, s_c, refused = admit(
-        geometry, material, s_c, _press.read_values(options), reach=options.half_width
+        geometry, material, motion.s_c, _press.read_values(options), reach=options.half_width
     )
     beam = _press.ligament_beam(geometry, material, options)
     unit = _press.unit_deflection(beam, s_c, options)
     law = _press.local_law(geometry, material, s_c, options)
     softening = _press.softening_of(material, options)
+    displacement, onset, blend = motion.displacement, motion.onset, motion.blend
+    assert onset is not None
+    assert motion.time is not None
     contact = _press.Contact(law, onset, blend, softening)
     elastic = _press.respond(displacement, unit.w_C, contact, options)
     moved = _press.touch(displacement, onset, options, blend)
-    time, order = in_order(time, displacement)
+    time, order = in_order(motion.time, displacement)
     relaxation, refused = _validated(relaxation, refused)
     skipped = order != PressStatus.OK
     solved = _in_time(time, moved, skipped, unit.w_C, law, relaxation, elastic, options)

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.relaxation import Branches, fading, mean_kept, overloads
+from jaxtrachea.relaxation.filter import overloads
+from jaxtrachea.relaxation.steps import Branches, fading, mean_kept
 
 #: Places within a step, and their weights, for the integral of what is taken.
 _PLACES, _WEIGHTS = np.polynomial.legendre.leggauss(5)

@@ -1,6 +1,6 @@
 r"""Local law and skeleton relax apart: branches of their own, one equilibrium a sample.
 
-Both parts are as in `mechanics.relaxation`, the local law with the elastic force e(d) and the
+Both parts are as in `relaxation.filter`, the local law with the elastic force e(d) and the
 skeleton with y = u / c. At the end of a step both carry the contact force,
 
     F = A e(d) + B = A_s y + B_s,   d + c y = D,
@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import added
 from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.relaxation import Branches, differentiable_in_lanes, factors, fading
+from jaxtrachea.relaxation.steps import Branches, differentiable_in_lanes, factors, fading
 
 
 class Parts(NamedTuple):
@@ -60,27 +60,26 @@ def relax_parts(
         unilateral: the contact lets go where it would pull (static).
     """
     loop = _unilateral if unilateral else _bonded
-    given = (*fading(time, local), *fading(time, skeleton))
-    return Parts(*loop(*given, displacement, compliance, law, local.gamma, skeleton.gamma))
+    parts = [(*fading(time, part), part.gamma) for part in (local, skeleton)]
+    return Parts(*loop(*parts, displacement, compliance, law))
 
 
-def _loop(
-    x,
-    lost,
-    x_s,
-    lost_s,
-    displacement,
-    compliance,
-    law: Law,
-    gamma,
-    gamma_s,
-    unilateral: bool = True,
-):
-    """Force, depth, load and fold; arrays may have lanes as their last axis: `relaxation`."""
+def _loop(local, skeleton, displacement, compliance, law: Law, unilateral: bool = True):
+    """Force, depth, load and fold; arrays may have lanes as their last axis.
+
+    Args:
+        local: x, lost and gamma of the local law, see `relaxation.steps`.
+        skeleton: those of the skeleton.
+        displacement: (N, *lanes).
+        compliance: of the skeleton.
+        law: local law.
+        unilateral: static.
+    """
+    (x, lost, gamma), (x_s, lost_s, gamma_s) = local, skeleton
 
     def step(state, sample):
         h, e, q, y = state
-        x, lost, x_s, lost_s, D = sample
+        (x, lost), (x_s, lost_s), D = sample
         kept, _, share = factors(x, lost, gamma)
         kept_s, _, share_s = factors(x_s, lost_s, gamma_s)
         A, B = 1 + added(share), _carried(kept, share, h, e)
@@ -99,7 +98,7 @@ def _loop(
 
     zero = jnp.zeros_like(displacement[0])
     start = (zero,) * gamma.shape[0], zero, (zero,) * gamma_s.shape[0], zero
-    return jax.lax.scan(step, start, (x, lost, x_s, lost_s, displacement))[1]
+    return jax.lax.scan(step, start, ((x, lost), (x_s, lost_s), displacement))[1]
 
 
 def _carried(kept, share, h, e):

@@ -272,49 +272,28 @@ _OF_THE_PRESS = (
 
 
 def _of_time(suffix: str, whose: str, needs: Needs) -> list[Declaration]:
-    """The numbers of all laws of relaxation, see `mechanics.relaxation_laws`."""
-    rest = {"part": "time", "needs": needs, "absent": "no relaxation"}
-    strength = Fitted(0.5, 1e-6, 1e6)
-    rows = [
-        Declaration(
-            f"gamma_{b}{suffix}", "1", "dimensionless",
-            f"strength of branch {b} of {whose} (prony), over what lasts", fit=strength, **rest,
-        )
-        for b in range(1, 5)
-    ]  # fmt: skip
-    rows.append(
-        Declaration(
-            f"tau_1{suffix}", "s", "time",
-            f"shortest relaxation time of {whose} (prony, fung)",
-            fit=Fitted(1.0, 1e-6, 1e6), **rest,
-        )
-    )  # fmt: skip
-    rows += [
-        Declaration(
-            f"tau_ratio_{b}{suffix}", "1", "dimensionless",
-            f"relaxation time of branch {b} of {whose} over the one before (prony)",
-            fit=Fitted(10.0, 2.0, 1e6), **rest,
-        )
-        for b in range(2, 5)
-    ]  # fmt: skip
-    return rows + [
-        Declaration(
-            f"gamma{suffix}", "1", "dimensionless",
-            f"strength of {whose} after 1 s (power), over what lasts", fit=strength, **rest,
-        ),
-        Declaration(
-            f"beta{suffix}", "1", "dimensionless", f"exponent of {whose} (power)",
-            fit=Fitted(0.2, 0.05, 0.4), **rest,
-        ),
-        Declaration(
-            f"C{suffix}", "1", "dimensionless",
-            f"strength of {whose} for each e-fold of time (fung), over what lasts",
-            fit=Fitted(0.1, 1e-6, 1e6), **rest,
-        ),
-        Declaration(
-            f"tau_2{suffix}", "s", "time", f"longest relaxation time of {whose} (fung)",
-            fit=Fitted(100.0, 1e-6, 1e9), **rest,
-        ),
+    """The numbers of all laws of relaxation, see `relaxation.laws`."""
+
+    def row(name: str, description: str, fit: Fitted) -> Declaration:
+        time = name in ("tau_1", "tau_2")
+        unit = ("s", "time") if time else ("1", "dimensionless")
+        return Declaration(
+            name + suffix, *unit, description, part="time", needs=needs, absent="no relaxation",
+            fit=fit,
+        )  # fmt: skip
+
+    strength, ratio = Fitted(0.5, 1e-6, 1e6), Fitted(10.0, 2.0, 1e6)
+    return [
+        *(row(f"gamma_{b}", f"strength of branch {b} of {whose} (prony), over what lasts", strength)
+          for b in range(1, 5)),
+        row("tau_1", f"shortest time of {whose} (prony, fung)", Fitted(1.0, 1e-6, 1e6)),
+        *(row(f"tau_ratio_{b}", f"time of branch {b} of {whose} over that before (prony)", ratio)
+          for b in range(2, 5)),
+        row("gamma", f"strength of {whose} after 1 s (power), over what lasts", strength),
+        row("beta", f"exponent of {whose} (power)", Fitted(0.2, 0.05, 0.4)),
+        row("C", f"strength of {whose} for each e-fold of time (fung), over what lasts",
+            Fitted(0.1, 1e-6, 1e6)),
+        row("tau_2", f"longest time of {whose} (fung)", Fitted(100.0, 1e-6, 1e9)),
     ]  # fmt: skip
 
 

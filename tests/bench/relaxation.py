@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.mechanics import relaxation_laws
 from jaxtrachea.mechanics.equilibrium import press_series, sensitivity
 from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.relaxation import Branches, relax, relax_with_derivatives
-from jaxtrachea.mechanics.relaxation_laws import Span
 from jaxtrachea.mechanics.relaxation_parts import relax_parts
+from jaxtrachea.relaxation import laws as relaxation_laws
+from jaxtrachea.relaxation.filter import relax, relax_with_derivatives
+from jaxtrachea.relaxation.laws import Span
+from jaxtrachea.relaxation.steps import Branches
 
 LANES, SAMPLES = 128, 200
 SPAN = Span(0.03, 30.0)

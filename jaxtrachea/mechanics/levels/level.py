@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Contact
-from jaxtrachea.mechanics.relaxation import Relaxation, relax
 from jaxtrachea.mechanics.samples import as_before, in_order, no_history
+from jaxtrachea.relaxation.filter import Relaxation, relax
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Declaration
@@ -155,6 +155,7 @@ class Level(abc.ABC):
         hangs_on_rings: a surface is bound to the rings; else to the wall of the level itself.
         hides_refused: it computes refused rows safely by itself.
         stepwise: a session can step it.
+        relaxes: its force relaxes: motions and records have their time.
     """
 
     observes: ClassVar[frozenset[str]]
@@ -167,6 +168,7 @@ class Level(abc.ABC):
     hangs_on_rings: ClassVar[bool] = True
     hides_refused: ClassVar[bool] = False
     stepwise: ClassVar[bool] = True
+    relaxes: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod

@@ -15,7 +15,7 @@ from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.press_in_time import press_in_time
-from jaxtrachea.mechanics.relaxation import Relaxation
+from jaxtrachea.relaxation.filter import Relaxation
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import DEEP, OF_PRESS, VALUES, Material, material_of
 
@@ -149,10 +149,8 @@ class Line(Level):
         self, tube: Geometry, material: Material, motion: Motion, relaxation: Relaxation
     ) -> Response:
         """See `press_in_time`: a unilateral contact lets go."""
-        found = press_in_time(
-            tube, material, motion.s_c, motion.time, motion.displacement, relaxation, self.options,
-            onset=motion.onset, blend=motion.blend,
-        )  # fmt: skip
+        motion = motion._replace(phi_c=None, direction=None)
+        found = press_in_time(tube, material, motion, relaxation, self.options)
         return Response(found.force, found.joints, found.status, reactions=found.reactions)
 
     def skeleton(

@@ -5,7 +5,7 @@ from typing import Literal
 
 from jaxtrachea._arguments import check_record, check_word
 from jaxtrachea.mechanics import beam as _beam
-from jaxtrachea.mechanics import relaxation_laws
+from jaxtrachea.relaxation import laws as relaxation_laws
 
 #: Words of the skeletons; `levels.choose` has the level of each.
 Skeleton = Literal["linear", "softening", "sections"]
@@ -39,7 +39,7 @@ class Options:
             but `half_width` applies). `press_sections` presses that one.
         relaxation: `off`, or how the force relaxes in time: `uniform`, the whole organ alike, or
             `parts`, local law and skeleton apart (needs `series`, and no `sections`).
-        branches: the law of relaxation, see `mechanics.relaxation_laws`.
+        branches: the law of relaxation, see `relaxation.laws`.
         shortest: step of the records, s, from which on `power` is one.
         longest: of the records, s, up to which it is.
     """

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.mechanics import relaxation_laws
 from jaxtrachea.mechanics.levels.level import Closed, Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.mechanics.relaxation import Relaxation
+from jaxtrachea.relaxation import laws as relaxation_laws
+from jaxtrachea.relaxation.filter import Relaxation
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_TIME
 
@@ -29,7 +29,7 @@ def _of_inner(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Relaxing(Level):
-    """The level within, its values those of the long run; see `mechanics.relaxation`.
+    """The level within, its values those of the long run; see `relaxation.filter`.
 
     Attributes:
         inner: the level within.
@@ -39,6 +39,7 @@ class Relaxing(Level):
     inner: Level
     options: Options
     stepwise: ClassVar = False
+    relaxes: ClassVar = True
     material_type = _of_inner("material_type")
     observes = _of_inner("observes")
     iterates = _of_inner("iterates")

@@ -1,4 +1,4 @@
-r"""Laws of relaxation: what turns few numbers into the branches of `mechanics.relaxation`.
+r"""Laws of relaxation: what turns few numbers into the branches of `relaxation.filter`.
 
 A law gives the reduced relaxation function G(t) of a sudden press, over what lasts: 1 + g(t).
 
@@ -23,7 +23,9 @@ import numpy as np
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
-from jaxtrachea.mechanics.relaxation import Branches, Relaxation
+from jaxtrachea._arguments import check_word
+from jaxtrachea.relaxation.filter import Relaxation
+from jaxtrachea.relaxation.steps import Branches
 
 #: What the name of a number ends in where it is the skeleton's.
 OF_SKELETON = "_skeleton"
@@ -73,6 +75,7 @@ def relaxation(
     Raises:
         ValueError: as `branches`.
     """
+    check_word("law", word, Word)
     local = branches(word, values, span)
     if not parts:
         return Relaxation(local)
@@ -82,6 +85,7 @@ def relaxation(
 
 def names(word: Word, *, parts: bool = False) -> tuple[str, ...]:
     """Names of the numbers that `relaxation` reads."""
+    check_word("law", word, Word)
     local = LAWS[word].names
     return local + tuple(name + OF_SKELETON for name in local if parts)
 
@@ -97,6 +101,7 @@ def branches(word: Word, values: Mapping[str, Float[Array, ""]], span: Span) -> 
     Raises:
         ValueError: a number that is wanting, or a span that is none.
     """
+    check_word("law", word, Word)
     law = LAWS[word]
     if wanting := [name for name in law.names if values.get(name) is None]:
         raise ValueError(f"the relaxation {word!r} needs {', '.join(wanting)}; none given")

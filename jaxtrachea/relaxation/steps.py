@@ -1,25 +1,8 @@
-r"""A force that relaxes: branches, each a spring and a dashpot, beside an elastic force (Fung).
+"""The loop over samples of a force that relaxes: one kernel on a CPU, with lanes as its last axis.
 
-Of the elastic force e and branches b of strength gamma_b and time tau_b the whole force is
-
-    F = e + sum_b h_b,   dh_b/dt = gamma_b de/dt - h_b / tau_b,
-
-so that e is what lasts and (1 + sum_b gamma_b) e what a sudden press meets. If all parts of the
-organ relax alike, its shape is the elastic one at every instant, and F is this filter of the
-elastic force of the whole: of any law, skeleton, width or direction (quasi-linear, Fung). How the
-tool came to the place does not matter, only the elastic force and the time.
-
-A step is exact for an e that is linear in time between samples, for any dt >= 0 (dt = 0: a jump):
-
-    h' = E h + P (e' - e),   E = exp(-x),   P = gamma (1 - E) / x,   x = dt / tau.
-
-A unilateral contact does not pull: where F would be negative it is 0, the tool has left, and the
-surface recovers by itself, e' = -B / A with A = 1 + sum P and B = sum (E h - P e).
-
-Nothing here knows what the elastic force is of.
+Steps over relaxation times are x, and `lost` what a step takes of a branch, expm1(-x).
 """
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -41,132 +24,8 @@ class Branches(NamedTuple):
             sample; infinite: it does not relax.
     """
 
-    gamma: Float[Array, " B"]
-    tau: Float[Array, " B"]
-
-
-class Relaxation(NamedTuple):
-    """What relaxes.
-
-    Attributes:
-        local: branches of the local law; of the whole organ where the skeleton has none.
-        skeleton: branches of the skeleton; None: all parts relax alike.
-    """
-
-    local: Branches
-    skeleton: Branches | None = None
-
-
-class Relaxed(NamedTuple):
-    """A force in time.
-
-    Attributes:
-        force: N; (N,) or (N, 3) as the elastic force is.
-        elastic: elastic force of the surface as it is, N: that of the tool's displacement, or where
-            the tool has left what the surface itself still has.
-    """
-
-    force: Float[Array, " N *k"]
-    elastic: Float[Array, " N *k"]
-
-    @property
-    def overload(self) -> Float[Array, " N *k"]:
-        """What the branches carry beside the elastic force, N."""
-        return self.force - self.elastic
-
-
-class Derivatives(NamedTuple):
-    """Derivatives of a `Relaxed`: first by the columns of the elastic force, then by the branches.
-
-    Attributes:
-        force: (C + K, N).
-        elastic: (C + K, N); None where it was not asked for.
-    """
-
-    force: Float[Array, "CK N"]
-    elastic: Float[Array, "CK N"] | None
-
-
-def relax(
-    time: Float[Array, " N"],
-    elastic: Float[Array, " N *k"],
-    branches: Branches,
-    unilateral: bool = True,
-) -> Relaxed:
-    """The force of an elastic force that relaxes, from rest before the first sample.
-
-    Derivatives of any order, in both modes, are those of the steps.
-
-    Args:
-        time: s, never falling. Padding repeats the last time and any finite elastic force, at the
-            end: no sample feels a later one.
-        elastic: what the displacement would meet in the long run, N; a vector (last axis) where the
-            contact cannot let go. What is not finite leaves all later samples so.
-        branches: see `Branches`.
-        unilateral: the contact lets go where it would pull; else it is bonded (static).
-
-    Raises:
-        ValueError: vectors of a unilateral contact.
-    """
-    if elastic.ndim > 1:
-        if unilateral:
-            raise ValueError("a vector has no sign to let go at; expected unilateral=False")
-        return jax.vmap(lambda e: relax(time, e, branches, False), -1, -1)(elastic)
-    x, lost = fading(time, branches)
-    if unilateral:
-        return Relaxed(*_filter(x, lost, elastic, branches.gamma))
-
-    def bonded(loop):
-        return lambda: loop(x, lost, elastic, branches.gamma)
-
-    # The loop is one kernel on a CPU; elsewhere each of its rounds would be several.
-    force = jax.lax.platform_dependent(
-        cpu=bonded(_bonded_filter), default=bonded(_bonded_in_parallel)
-    )
-    return Relaxed(force, elastic)
-
-
-def relax_with_derivatives(
-    time: Float[Array, " N"],
-    elastic: Float[Array, " N"],
-    columns: Float[Array, "C N"],
-    branches: Branches,
-    unilateral: bool = True,
-    along: Branches | None = None,
-    *,
-    surface: bool = False,
-) -> tuple[Relaxed, Derivatives]:
-    """`relax` and its derivatives, carried beside it: a third of what `jax.jvp` of it takes.
-
-    Args:
-        time: s; as in `relax`.
-        elastic: N.
-        columns: derivatives of the elastic force by whatever it depends on.
-        branches: see `Branches`.
-        unilateral: as in `relax` (static).
-        along: changes of gamma and tau in K directions, each (K, B), as `jax.jvp` of what makes the
-            branches gives them; None: the 2 B of the logarithm of each gamma, then of each tau.
-        surface: whether derivatives of `Relaxed.elastic` are asked for, which joints follow
-            (static).
-
-    Returns:
-        The force, and its derivatives by the C columns and along the K directions.
-    """
-    if along is not None:
-        # A branch that never relaxes has no change of log tau.
-        log_tau = jnp.where(along.tau == 0, 0, along.tau / branches.tau[None])
-        along = Branches(along.gamma.T, log_tau.T)
-    x, lost = fading(time, branches)
-    loop = functools.partial(_loop_with_derivatives, unilateral=unilateral, surface=surface)
-    # Samples and branches in front, as the loop reads them.
-    force, of_surface, d_force, d_surface = _lanes_last(loop)(
-        x, lost, elastic, columns.T, branches.gamma, along
-    )
-    d_surface = None if d_surface is None else d_surface.T
-    return Relaxed(force, of_surface), Derivatives(d_force.T, d_surface)
-
-
-# Steps
+    gamma: Float[Array, "*B"]
+    tau: Float[Array, "*B"]
 
 
 def fading(time, branches: Branches):
@@ -281,15 +140,7 @@ def _bonded_loop(x, lost, elastic, gamma):
     return _loop(x, lost, elastic, gamma, False)[0]
 
 
-def overloads(
-    time: Float[Array, " N"], elastic: Float[Array, " N"], branches: Branches
-) -> Float[Array, "N B"]:
-    """What each branch carries, N, of the elastic force of the surface (`Relaxed.elastic`)."""
-    x, lost = fading(time, branches)
-    return _in_parallel(x, lost, elastic, branches.gamma)
-
-
-def _in_parallel(x, lost, elastic, gamma):
+def in_parallel(x, lost, elastic, gamma):
     """`overloads` by an associative scan: it is linear in all samples."""
     pushed = gamma[None] * _mean(x, lost) * jnp.diff(elastic, prepend=0)[:, None]
 
@@ -299,8 +150,9 @@ def _in_parallel(x, lost, elastic, gamma):
     return jax.lax.associative_scan(after, (1 + lost, pushed))[1]
 
 
-def _bonded_in_parallel(x, lost, elastic, gamma):
-    return elastic + jnp.sum(_in_parallel(x, lost, elastic, gamma), axis=-1)
+def bonded_in_parallel(x, lost, elastic, gamma):
+    """Force of a bonded contact, as `bonded_filter`, by `in_parallel`."""
+    return elastic + jnp.sum(in_parallel(x, lost, elastic, gamma), axis=-1)
 
 
 def mean_kept(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -308,7 +160,7 @@ def mean_kept(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return _mean(x, _lost(x))
 
 
-def _loop_with_derivatives(
+def loop_with_derivatives(
     x, lost, elastic, columns, gamma, along, *, unilateral: bool, surface: bool
 ):
     """`_loop`, and derivatives of its results by C columns and along K directions; lanes as there.
@@ -370,7 +222,7 @@ def _loop_with_derivatives(
     return jax.lax.scan(step, start, (x, lost, elastic, columns))[1]
 
 
-def _lanes_last(loop):
+def lanes_last(loop):
     """A loop over samples as one kernel on a CPU, also of many lanes (`vmap`), its last axis.
 
     What one step reads of all lanes lies together then, and is computed several at a time.
@@ -395,7 +247,7 @@ def _lanes_last(loop):
 
 def differentiable_in_lanes(loop):
     """The loop in lanes; its derivatives are those of the loop as it stands, in both modes."""
-    in_lanes = jax.custom_jvp(_lanes_last(loop))
+    in_lanes = jax.custom_jvp(lanes_last(loop))
 
     @in_lanes.defjvp
     def _(primals, tangents):
@@ -404,5 +256,5 @@ def differentiable_in_lanes(loop):
     return in_lanes
 
 
-_filter = differentiable_in_lanes(_loop)
-_bonded_filter = differentiable_in_lanes(_bonded_loop)
+unilateral_filter = differentiable_in_lanes(_loop)
+bonded_filter = differentiable_in_lanes(_bonded_loop)

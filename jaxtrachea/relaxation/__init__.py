@@ -1,0 +1,1 @@
+"""How a force relaxes in time, whatever it is the force of: laws, the filter and its steps."""
