@@ -167,7 +167,7 @@ def relaxed_press(
     last = len(elastic) + (pressed.corner is not None)
     order = np.argsort([*elastic, *of_time], kind="stable")
 
-    def in_order(v):
+    def in_order(v) -> Any:
         return None if v is None else jnp.concatenate([v[: len(elastic)], v[last:]])[order]
 
     force, d_force = relaxed.force, in_order(slopes.force)

@@ -133,7 +133,7 @@ def residual_value(
         felt = _felt(model, skeleton)
         solved = _closed(model).respond(trial.displacement, felt, at.contact)
         force, load = solved.force, solved.force if solved.load is None else solved.load
-        if model.relaxes:
+        if trial.time is not None:
             values = values_of(model, free, trial.value)
             force, load = relaxed_value(model, values, trial.time, solved)
         joints = None if skeleton.joints is None else _times(load, skeleton.joints)
@@ -360,7 +360,7 @@ def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, tria
     """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
     motion = Motion(trial.s_c, trial.displacement, blend=trial.blend)
     pressed = _press(model, tube, free, trial.value, skeleton, by_beam, motion)
-    if model.relaxes:
+    if trial.time is not None:
         pressed = relaxed_press(model, free, trial.value, trial.time, pressed)
     joints, d_joints = None, None
     if skeleton.joints is not None and pressed.d_joints is not None:

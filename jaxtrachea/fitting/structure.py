@@ -400,7 +400,7 @@ def without_curves(study: Study) -> Study:
     """The study with curves of one sample: what the inputs need and no more."""
     lanes = study.lanes
     one = {name: getattr(lanes, name)[:, :, :1] for name in ("displacement", "force", "precision")}
-    if lanes.time is not None:
+    if lanes.time is not None and lanes.rising is not None:
         one |= {"time": lanes.time[:, :, :1], "rising": lanes.rising[:, :, :1]}
     if lanes.joints is not None:
         one |= {name: getattr(lanes, name)[:, :, :1] for name in ("joints", "joint_precision")}

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -130,7 +131,7 @@ def unit_direction(raw: RawCurve) -> tuple[float, float]:
     return float(unit[0]), float(unit[1])
 
 
-def vectors_of(raw: RawCurve, keep: np.ndarray, options: ReadOptions) -> dict[str, np.ndarray]:
+def vectors_of(raw: RawCurve, keep: np.ndarray, options: ReadOptions) -> dict[str, Any]:
     """Fields of a curve for markers, ends and side force: the samples kept, as float64.
 
     Args:

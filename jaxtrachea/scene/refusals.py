@@ -22,7 +22,7 @@ REFUSALS = (PressStatus.OFF_TUBE, PressStatus.OFF_PLAN, PressStatus.BEHIND_GAP,
             PressStatus.IN_LUMEN, PressStatus.NON_FINITE, PressStatus.BAD_MATERIAL)  # fmt: skip
 
 
-def without_negative_values(scene: Scene, material: AnyMaterial):
+def without_negative_values(scene: Scene, material: AnyMaterial) -> tuple[Any, Bool[Array, ""]]:
     """The material with 1 in place of negative values that the plan reads, and whether it had any.
 
     A negative coefficient of friction counts as well (`press_path` puts 0 in its place).

@@ -154,17 +154,17 @@ def pressed(
         place: where all rows press, if it is known already (a step of a session).
     """
     plan = scene.plan
-    material, bad = without_negative_values(scene, material)
+    safe, bad = without_negative_values(scene, material)
     given = path if isinstance(path, Presses) else None
-    presses, used, inward, refused = refuse(scene, material, given, made, bad)
+    presses, used, inward, refused = refuse(scene, safe, given, made, bad)
     if place is None:
-        moved = move(scene, material, used)
+        moved = move(scene, safe, used)
     else:
         moved = moved_by(press_at(place, used.displacement, plan.options), plan)
     force, moment, solved = moved.force, None, moved.status
     of_joints = plan.mechanics.hangs_on_rings
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:
-        force, moment = force_by_pose(scene, material, path, used, moved, made)
+        force, moment = force_by_pose(scene, safe, path, used, moved, made)
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
     way = None if made is None else made._replace(pull=None)

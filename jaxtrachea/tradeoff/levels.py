@@ -124,7 +124,8 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
     Raises:
         PlanError: a wish that cannot be met.
     """
-    scene, material, path = staged.scene, staged.material, staged.path
+    scene, path = staged.scene, staged.path
+    material: Any = staged.material
     if not scene.plan.mechanics.hangs_on_rings:
         why = "nothing of deforming cross-sections is traded for time"
         raise PlanError("skeleton", "'sections'", why, "leave [plan] out, or give [material]")
