@@ -104,7 +104,8 @@ WITHIN = {
         {"verify"},
         {"fit"},
     ],
-    "optimisation": [{"curvature", "programs", "schur"}, {"trust_region"}, {"levenberg_marquardt"}],
+    "optimisation": [{"batching", "curvature", "programs", "schur"}, {"trust_region"},
+                     {"levenberg_marquardt"}],
     "inference": [
         {"rows", "residuals", "chains", "together", "weakest_direction", "estimate",
          "random_effects"},

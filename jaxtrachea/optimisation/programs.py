@@ -34,11 +34,6 @@ def program(
     return Traced(function, *static, axes=axes, donate=donate, unoptimised=unoptimised)
 
 
-def batch_size(total: int, most: int) -> int:
-    """Lanes computed together: few different sizes, so that few programs are compiled."""
-    return 1 if total == 1 else min(most, max(16, 1 << (total - 1).bit_length()))
-
-
 def cast(tree: Any, dtype) -> Any:
     """Floating-point numpy arrays of a tree in a dtype; others stay."""
 
