@@ -106,7 +106,8 @@ WITHIN = {
         {"verify"},
         {"fit"},
     ],
-    "optimisation": [{"curvature", "programs", "schur"}, {"trust_region"}, {"levenberg_marquardt"}],
+    "optimisation": [{"batching", "curvature", "programs", "schur"}, {"trust_region"},
+                     {"levenberg_marquardt"}],
     "inference": [
         {"rows", "residuals", "chains", "together", "weakest_direction", "estimate",
          "random_effects"},
@@ -130,7 +131,7 @@ WITHIN = {
         {"measure"},
     ],
     "report": [{"plots", "tables", "understood"}, {"fit"}, {"overview"}],
-    "cli": [{"terminal_table", "specification", "options"}, {"terminal"},
+    "cli": [{"terminal_table", "specification", "options", "beside"}, {"terminal"},
             {"file_options", "fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"sources"}, {"written_spec"},
             {"compare", "cache", "convert", "init", "predict", "tradeoff"}, {"main"}],
@@ -293,3 +294,48 @@ def test_an_analysis_knows_no_other_and_draws_only_when_asked():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+#: Modules that take a tenth of a second or more to load, beside those of `HEAVY`.
+SLOW = {*HEAVY, "jax", "equinox", "optax", "pandas", "openpyxl", "afmformats", "distributed",
+        "xarray", "blackjax", "PIL", "scipy", "scipy.integrate", "scipy.interpolate",
+        "scipy.optimize", "scipy.spatial", "scipy.special", "scipy.stats"}  # fmt: skip
+SHOWS = {"typer", "rich", "pydantic"}
+READS = {"jax", "equinox", "h5py"} | SHOWS
+FIT, SCENE = (
+    PACKAGE.parent / "fits/virtual_trachea/fit.toml",
+    PACKAGE.parent / "configs/normal.toml",
+)
+#: Commands, and which of those they may load.
+LOADS = {
+    "--version": (["--version"], SHOWS),
+    "init": (["init", FIT.with_name("small_strain.h5")], READS),
+    "check": (["check", FIT], READS),
+    # The hull of the tool, and how far its patches are from the wall.
+    "plan": (["plan", SCENE], READS | {"scipy", "scipy.spatial", "scipy.special"}),
+    # JAX itself takes LAPACK from scipy.
+    "fit": (["fit", FIT], READS | {"scipy", "scipy.special", "matplotlib", "PIL"}),
+    "simulate": (
+        ["simulate", SCENE],
+        READS | {"scipy", "scipy.spatial", "scipy.special", "matplotlib", "PIL"},
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("fit", "simulate"))) for n in LOADS]
+)
+def test_a_command_loads_what_it_needs(name, tmp_path):
+    words, may = LOADS[name]
+    code = (
+        "import sys\n"
+        "from jaxtrachea.cli.main import main\n"
+        f"sys.argv = ['jaxtrachea', *{list(map(str, words))!r}]\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        f"print('loaded', *sorted(m for m in {SLOW!r} if m in sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    loaded = set(done.stdout.splitlines()[-1].split()[1:])
+    assert loaded <= may, loaded - may

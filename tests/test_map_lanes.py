@@ -15,7 +15,7 @@ from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.optimisation.programs import batch_size
+from jaxtrachea.optimisation.batching import batch_size
 from jaxtrachea.optimisation.trust_region import Tolerances
 
 
@@ -83,9 +83,26 @@ def test_loops_over_lanes_compile_once(study, compiled, loop):
     assert len(compiled) == 1
 
 
-@pytest.mark.parametrize(("total", "size"), [(1, 1), (2, 16), (17, 32), (100, 128), (5000, 128)])
-def test_few_sizes(total, size):
-    assert batch_size(total, 128) == size
+SIZES = {"cpu": {1: 1, 2: 4, 8: 4, 15: 4, 16: 16, 17: 16, 100: 64, 5000: 128},
+         "gpu": {1: 1, 2: 16, 17: 32, 100: 128, 5000: 128}}  # fmt: skip
+
+
+@pytest.mark.parametrize("device", SIZES)
+def test_few_sizes(device, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
+    for total, size in SIZES[device].items():
+        assert batch_size(total, 128) == size
+        assert batch_size(total, 3) == min(size, 3)
+
+
+def test_less_than_half_of_a_batch_is_nobodys(monkeypatch):
+    """Of four lanes or more, on a CPU; of large batches a quarter at most."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    for total in range(4, 3000):
+        size = batch_size(total, 128)
+        computed = -(-total // size) * size
+        assert computed < 2 * total
+        assert total < 1000 or computed < 1.25 * total
 
 
 @pytest.mark.parametrize(("lanes", "quick"), [(40, True), (65, False)])
@@ -96,12 +113,11 @@ def test_compliances_of_other_skeletons_are_quick_for_few_lanes_only(lanes, quic
     seen = []
 
     def watched(function, study, theta, *, batch, rows, unoptimised):
-        seen.append((len(theta) <= batch, unoptimised))
-        return np.ones((len(theta), other_starts.TOGETHER, 4))
+        seen.append(unoptimised)
+        return np.ones((len(theta), 4))
 
     monkeypatch.setattr(other_starts, "map_lanes", watched)
     result = object.__new__(FitResult)  # what is read of one
     vars(result).update(study=study, theta=np.log(truth), status=np.zeros(lanes, int))
     other_starts.twins(result, np.arange(2))
-    assert [one for _, one in seen] == [quick] * 2
-    assert quick or all(at_once for at_once, _ in seen)
+    assert seen == [quick] * 2

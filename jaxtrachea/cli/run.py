@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from jaxtrachea.cli.beside import beside, load_beside
 from jaxtrachea.cli.terminal import Stages, Stop, progress_bar, say_lost, table, to_stderr
 
 
@@ -31,6 +32,7 @@ def run(request, stop_if_asked, fit=None):
     with progress_bar() as bar:
         stages = Stages(bar, stop_if_asked)
         progress = stages.begin("fitting")
+        load_beside("jaxtrachea.report.plots")
         result = (fit or in_one_go)(request.study, request.settings, progress)
         findings = analyse(request, result, stages.begin)
         stages.close()
@@ -58,26 +60,28 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.trials.differences import differing_trials
     from jaxtrachea.trials.repeats import trial_remarks, trial_sentences
 
-    Table(summary_rows(findings, measurements.bad)).write_csv(folder / "summary.csv")
-    Table(parameter_rows(findings)).write_csv(folder / "parameters.csv")
-    apart = differing_trials(measurements.curves)
-    zeros, of_trials = cells(findings.result.study), trial_remarks(apart)
-    rows = []
-    for row in usage_rows(measurements.curves):
-        curve = str(row["specimen"]), str(row["trial"])
-        remarks = "; ".join(filter(None, (str(row["remarks"]), of_trials.get(curve))))
-        rows.append(row | {"remarks": remarks} | zeros.get(curve, {}))
-    Table(rows).write_csv(folder / "curves.csv")
-    write_tables(folder, findings)
-    drawn, lost = draw_all(folder, findings)
+    with beside(draw_all, folder, findings) as drawing:
+        Table(summary_rows(findings, measurements.bad)).write_csv(folder / "summary.csv")
+        Table(parameter_rows(findings)).write_csv(folder / "parameters.csv")
+        apart = differing_trials(measurements.curves)
+        zeros, of_trials = cells(findings.result.study), trial_remarks(apart)
+        rows = []
+        for row in usage_rows(measurements.curves):
+            curve = str(row["specimen"]), str(row["trial"])
+            remarks = "; ".join(filter(None, (str(row["remarks"]), of_trials.get(curve))))
+            rows.append(row | {"remarks": remarks} | zeros.get(curve, {}))
+        Table(rows).write_csv(folder / "curves.csv")
+        write_tables(folder, findings)
+        title = loaded.title or spec.stem
+        curves = measurements.curves
+        weighed = findings.result.study.weighs_noise
+        more = trial_sentences(curves, found=apart, weighed=weighed)
+        used = usage_section(curves, measurements.notes, more)
+        lines = understood(loaded, findings.result.study, findings.result)
+        text = report_text(title, findings, measurements.bad, used, lines)
+        drawn, lost = drawing.result()
     say_lost(lost)
-    title = loaded.title or spec.stem
-    curves = measurements.curves
-    weighed = findings.result.study.weighs_noise
-    more = trial_sentences(curves, found=apart, weighed=weighed)
-    used = usage_section(curves, measurements.notes, more)
-    lines = understood(loaded, findings.result.study, findings.result)
-    text = without_lost(report_text(title, findings, measurements.bad, used, lines), lost)
+    text = without_lost(text, lost)
     write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")

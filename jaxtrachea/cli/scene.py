@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from jaxtrachea.cli.beside import beside, load_beside
 from jaxtrachea.cli.options import OutOption
 from jaxtrachea.cli.terminal import (
     Stages,
@@ -76,15 +77,18 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     staged, choice = _chosen(scene, spec, staged)
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
+        if spec.output.pictures:
+            load_beside("jaxtrachea.scene.plots")
         out = jax.block_until_ready(Traced(run)(staged.scene, staged.material, staged.path))
         clock.append(time.perf_counter())
         stop_if_asked()
-        write_meshes(folder, staged.scene, out)
-        if spec.output.pictures:
-            _draw(folder, spec.title or scene.stem, staged.scene, out)
-        made = _provenance(scene, staged, clock)
-        write_simulation(folder / "simulation.h5", staged.scene, staged.path, out, made)
-        _write_json(folder, made)
+        title = spec.title or scene.stem
+        with beside(_draw, folder, title, spec.output.pictures, staged.scene, out) as drawing:
+            write_meshes(folder, staged.scene, out)
+            made = _provenance(scene, staged, clock)
+            write_simulation(folder / "simulation.h5", staged.scene, staged.path, out, made)
+            _write_json(folder, made)
+            say_lost(drawing.result())
     _print_rows(out)
     failed = _print_failures(out.status, "row(s)")
     for note in staged.notes:
@@ -119,6 +123,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     with into(out_dir, _default(scene, "-sweep")) as (folder, stop_if_asked):
         size, parts, total = want.chunk, [], len(points[0])
         compute = Traced(run, chunk=size)
+        load_beside("jaxtrachea.scene.plots")
         with progress_bar() as bar:
             task = bar.add_task("sweeping", total=total)
             for start in range(0, total, size):
@@ -266,7 +271,10 @@ def _rows(staged) -> int:
     return len(path.s if isinstance(path, Presses) else path.translation)
 
 
-def _draw(folder: Path, title: str, scene, out) -> None:
+def _draw(folder: Path, title: str, pictures: bool, scene, out) -> dict[str, str]:
+    """Draw what is asked for; why a picture could not be drawn, by file name."""
+    if not pictures:
+        return {}
     import numpy as np
 
     from jaxtrachea.files.pictures import save_each
@@ -277,7 +285,7 @@ def _draw(folder: Path, title: str, scene, out) -> None:
     row = last_solved(out)
     if out.vertices is not None and row is not None:
         drawings["surface.png"] = partial(draw_surface, scene, np.asarray(out.vertices[row]), title)
-    say_lost(save_each(folder, drawings)[1])
+    return save_each(folder, drawings)[1]
 
 
 def _provenance(scene: Path, staged, clock: list[float]) -> dict:

@@ -19,7 +19,7 @@ from jaxtrachea.measurements.read import (
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.sections.material import LEAST, SECTION_VALUES, Wall
-from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS
+from jaxtrachea.optimisation.batching import MOST_SLOTS
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.units import UnitError, parse_quantity

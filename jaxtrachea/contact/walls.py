@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from jaxtrachea.contact.line import Centreline
 from jaxtrachea.contact.patches import Patches, check_borders
@@ -142,6 +141,8 @@ def _between(tube: _Tube, span: tuple[float, float], overlap: float, rounding: f
     Raises:
         ValueError: naming the span.
     """
+    from scipy.spatial import QhullError
+
     (low, high), (v, s, edges, line) = span, tube
     a, b = np.clip((low - overlap, high + overlap), s.min(), s.max())
     inside = v[(s >= a) & (s <= b)]
@@ -204,6 +205,8 @@ def _section(v, s, edges, at):
 
 def _patch(inside, ends, own, station, rounding, most):
     """Core (3, n), radius, middle, lost and filled of one patch."""
+    from scipy.spatial import ConvexHull, HalfspaceIntersection
+
     middle, (t, t_low, t_high) = station
     side = _sides(np.concatenate([inside, *ends]), t)
     largest = (-(side[:, :3] @ middle) - side[:, 3]).min()
@@ -244,6 +247,8 @@ def _sides(points, t):
 
     Where the tube opens steeply there is none of the first kind; the others always close it.
     """
+    from scipy.spatial import ConvexHull
+
     faces = ConvexHull(points).equations
     across = np.linalg.svd(t[None])[2][1:]
     turn = 2 * np.pi * np.arange(ACROSS) / ACROSS

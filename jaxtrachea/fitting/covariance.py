@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import stdtrit
 
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.structure import leaving_alone
@@ -159,6 +158,8 @@ def half_widths(
     dof: np.ndarray, *, noise_known: Bool[np.ndarray, " lanes"]
 ) -> Float[np.ndarray, " lanes"]:
     """Of 95 % intervals in standard errors: normal with known noise, else Student's t; (lanes,)."""
+    from scipy.special import stdtrit
+
     half = np.full(len(dof), NORMAL)
     different, which = np.unique(np.maximum(dof, 1), return_inverse=True)
     of_t = stdtrit(different, 0.975)[which.reshape(-1)]

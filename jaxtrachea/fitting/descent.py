@@ -11,7 +11,6 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_record
@@ -110,6 +109,8 @@ def descend(
 
 def _descend(model, descent: Descent, start, lane, sigma):
     """One start: blocks of steps until the cost settles."""
+    import optax
+
     method, tolerances, block = descent.method, descent.tolerances, descent.block
 
     def loss(theta):

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import stdtrit
 
 from jaxtrachea.fitting.information import held_count, unknown_count
 from jaxtrachea.fitting.misfit import Residuals, misfit
@@ -130,6 +129,8 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
         of: residuals of the fit.
         plain: half of a 95 % interval in standard errors, of independent residuals; (lanes,).
     """
+    from scipy.special import stdtrit
+
     study, lanes = of.study, of.study.lanes
     n = np.asarray(of.samples, float)
     worth = effective_samples(_together(of) if study.joint else of.seen)

@@ -2,12 +2,12 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import QUICK, Study
+from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.batching import UNOPTIMISED_LANES, on_cpu
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
@@ -20,19 +20,19 @@ SAME = 1e-3
 def serves(study: Study, settings: Settings, starts: int) -> bool:
     """Whether so many starts take less time by a few samples of each curve first.
 
-    Not of short curves, nor of so few starts that compiling takes longer (`QUICK`). Nor where the
-    few may not tell: a force that remembers what lies between them, markers (seen in some samples
-    alone), the samples next to a fitted onset, the outliers of a robust loss. Nor where no doubt is
-    followed up afterwards: what is one minimum of the few may be two of all. Joint studies,
-    deforming cross-sections, single precision, other solvers and other devices than CPUs, where
-    nothing was measured, go their own way.
+    Not of short curves, nor of so few starts that compiling takes longer. Nor where the few may not
+    tell: a force that remembers what lies between them, markers (seen in some samples alone), the
+    samples next to a fitted onset, the outliers of a robust loss. Nor where no doubt is followed up
+    afterwards: what is one minimum of the few may be two of all. Joint studies, deforming
+    cross-sections, single precision, other solvers and other devices than CPUs, where nothing was
+    measured, go their own way.
     """
     lanes, model = study.lanes, study.model
-    long = lanes.force.shape[-1] >= TIMES * KEPT and starts > QUICK[0]
+    long = lanes.force.shape[-1] >= TIMES * KEPT and starts > UNOPTIMISED_LANES
     forces_alone = lanes.joints is None and lanes.time is None and not model.level.iterates
     tells = forces_alone and lanes.blend is None and model.loss == "linear" and settings.verify
     solver = settings.method == "levenberg-marquardt" and not settings.float32
-    return long and tells and solver and not study.joint and jax.default_backend() == "cpu"
+    return long and tells and solver and not study.joint and on_cpu()
 
 
 def few_samples(study: Study) -> Study:

@@ -151,7 +151,7 @@ def _verified(result, minima: Minima, known: Structure, settings, progress) -> F
         if not turns_left or not len(rows):
             return dataclasses.replace(result, **evidence._asdict())
         # As many as the fit computes together: the same program.
-        batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
+        batch = result.study.batch_size(result.lanes * settings.starts, settings.batch)
         full = rows[np.arange(max(len(rows), batch)) % len(rows)]
         part = reduced(result.study.take(full), known.pinned[full])
         one = dataclasses.replace(settings, starts=1)

@@ -18,11 +18,9 @@ from jaxtrachea.fitting.shared import solve_jointly
 from jaxtrachea.fitting.starts import add_starts, best, draw_starts
 from jaxtrachea.fitting.structure import Structure, reduced
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.batching import NEXT
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.status import FitStatus
-
-#: Lanes computed together where only a few are left.
-FEW = 16
 
 
 class Minima(NamedTuple):
@@ -177,8 +175,9 @@ def _by_few_samples(study: Study, settings: Settings, rows, starts, sigma, progr
 
 def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
     """Further starts of a few lanes; their batch does not depend on how many there are."""
-    settings = dataclasses.replace(settings, batch=min(settings.batch, FEW))
-    together = max(len(rows), FEW)
+    first = study.batch_size(len(study.curves) * settings.starts, settings.batch)
+    settings = dataclasses.replace(settings, batch=min(first, NEXT))
+    together = max(len(rows), settings.batch)
     return _solve(study, settings, rows, starts, sigma, _only_alive(progress), together=together)
 
 

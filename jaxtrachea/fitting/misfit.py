@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import chdtr, chdtrc
 
 from jaxtrachea.fitting.information import held_count, unknown_count
 from jaxtrachea.fitting.lane import Observed, forces, markers
@@ -76,6 +75,8 @@ def misfit(of: Residuals) -> Misfit:
 
 def _against_noise(of: Residuals, kinds: list[Observed]):
     """Ratio of some kinds of residuals to their sigma, and whether it is told; (lanes,) each."""
+    from scipy.special import chdtr, chdtrc
+
     study, lanes = of.study, of.study.lanes
     sizes = []
     for kind in kinds:

@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import simpson
 
 from jaxtrachea.fitting.cost import robust
 from jaxtrachea.fitting.information import Information
@@ -69,7 +68,9 @@ def normal_psi2(loss: Loss, scale: float) -> float | None:
         return None
     z = np.linspace(-8, 8, 1601)
     psi = z * np.asarray(robust(loss, jnp.asarray(z * z), scale)[1])
-    return float(simpson(psi**2 * np.exp(-(z**2) / 2), x=z) / np.sqrt(2 * np.pi))
+    weight = np.where(np.arange(z.size) % 2, 4, 2) / 3 * (z[1] - z[0])
+    weight[[0, -1]] /= 2
+    return float(weight @ (psi**2 * np.exp(-(z**2) / 2)) / np.sqrt(2 * np.pi))
 
 
 def precision_unit(study: Study) -> np.ndarray:

@@ -6,7 +6,6 @@ where another skeleton has nearly the same compliances at the contacts (`twins`)
 
 import dataclasses
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -19,12 +18,10 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.structure import positions, without_curves
 from jaxtrachea.mechanics.force_law import coefficient, power
+from jaxtrachea.optimisation.batching import batch_size, most_in_cache
 
 #: Indentation over skeleton deflection, and its inverse, of the two starts.
 SOFT = 19.0
-#: Lanes whose compliances are computed together, of few and of many lanes in all, and points of
-#: each: one program serves any number.
-FEW, MANY, TOGETHER = 16, 64, 32
 #: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
 #: (half width in natural logarithms, points of each axis).
 TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
@@ -74,23 +71,21 @@ def _compliance(result: FitResult, lanes, theta) -> Float[np.ndarray, "n points 
     """
     study = result.study
     count, points, size = theta.shape
-    rows = -(-points // TOGETHER)
-    filled = np.minimum(np.arange(rows * TOGETHER), points - 1)
-    theta = theta[:, filled].reshape(count * rows, TOGETHER, size)
     bare = without_curves(study)
     read = bare.lanes._replace(joints=None, joint_precision=None)  # their motion is not asked for
     bare = dataclasses.replace(bare, lanes=read)
-    unoptimised = study.unoptimised(result.lanes)
+    # Of few points too: one program.
+    batch = batch_size(TWIN_POINTS**2, most_in_cache(bare.bytes_per_lane))
     c = map_lanes(
-        _felt_compliance, bare, theta, batch=FEW if unoptimised else MANY,
-        rows=np.repeat(lanes, rows), unoptimised=unoptimised,
+        _felt_compliance, bare, theta.reshape(-1, size), batch=batch,
+        rows=np.repeat(lanes, points), unoptimised=study.unoptimised(result.lanes),
     )  # fmt: skip
-    return c.reshape(count, rows * TOGETHER, -1)[:, :points]
+    return c.reshape(count, points, -1)
 
 
 def _felt_compliance(model: FitModel, theta, lane: Lane):
-    """Compliance at every trial of one lane at some points, mm/N; (points, T)."""
-    return jax.vmap(lambda one: inputs(model, one, lane).compliance)(theta)
+    """Compliance at every trial of one lane, mm/N; (T,)."""
+    return inputs(model, theta, lane).compliance
 
 
 def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:

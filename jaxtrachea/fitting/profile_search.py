@@ -8,6 +8,7 @@ from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import leaving_alone, pins
+from jaxtrachea.optimisation.batching import copied_together
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.status import FitStatus, ProfileEnd
 
@@ -17,8 +18,6 @@ _ROUNDS = 40
 _FAILURES = 6
 #: Relative accuracy of sqrt(statistic) at an end.
 _ACCURACY = 1e-6
-#: Refits handed to the solver at a time; bounds the memory.
-_AT_ONCE = 8192
 
 
 class Sides:
@@ -53,7 +52,7 @@ class Sides:
         self.first = np.clip(self.target * u.se[lane, unknown], 1e-9 * (1 + np.abs(here)), None)
         self.first = np.where(np.isfinite(self.first), self.first, 1.0)
         starts = result.lanes * settings.starts
-        self.batch = result.study.batch_size(max(starts, 16), settings.batch)
+        self.batch = result.study.batch_size(max(starts, 2), settings.batch)
         self.unoptimised = result.study.unoptimised(starts)
         self.sigma = result.whitened_sigma
         self.cost = self._costs_at_estimate()
@@ -121,8 +120,9 @@ class Sides:
             theta (n, P), statistic (n,), NaN where the fit did not converge.
         """
         thetas, statistics = [np.zeros((0, start.shape[1]))], [np.zeros(0)]
-        for first in range(0, len(side), _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
+        copied = copied_together(self.result.study.bytes_per_lane)
+        for first in range(0, len(side), copied):
+            part = slice(first, first + copied)
             s, d = side[part], distance[part]
             here = self.best[s] + (self.sign[s] * d)[:, None]
             own = np.arange(start.shape[1])[None] == self.unknown[s][:, None]

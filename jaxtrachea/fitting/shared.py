@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon
@@ -151,6 +150,8 @@ def _single(task: _Task, study: Study, rows, starts, progress=None) -> Solved:
 
 def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
     """One start: iterations until the shared unknowns and all lanes rest."""
+    from scipy.linalg import norm  # of numbers whose squares overflow too
+
     lanes = task.study.lanes
 
     def clip(theta):
@@ -188,7 +189,7 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         promised = -(gradient @ step + 0.5 * step @ hessian @ step) + np.sum(
             reduced.predicted_decrease[alive]
         )
-        length = scipy.linalg.norm(step)
+        length = norm(step)
         if fall < 0.25 * promised:
             radius = 0.25 * (min(radius, length) if length > 0 else radius)
         elif fall > 0.75 * promised:

@@ -31,6 +31,7 @@ from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.levels.level import Closed
 from jaxtrachea.mechanics.press import Contact
 from jaxtrachea.mechanics.softening import Softening
+from jaxtrachea.optimisation.batching import PATHS, most_slots
 from jaxtrachea.relaxation.laws import names
 
 #: Points of the parameter box, and half its width in decades.
@@ -39,8 +40,6 @@ POINTS, DECADES = 8, 2.0
 DECADES_OF_PATHS = 0.3
 #: Ratio of singular values, and part of an unknown in a direction, that are taken as zero.
 ZERO, NO_PART = 1e-7, 1e-3
-#: Lanes computed together.
-_BATCH = 64
 #: Tool displacements of a generic curve, mm; with c and the law's k_n near 1 it is as bent as can
 #: be.
 _GENERIC_DEPTHS = np.linspace(0.2, 3.0, 24)
@@ -235,7 +234,9 @@ def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
     if study.model.level.closed is None:
         return _seen_of_curves(study, lanes, theta)
-    J = map_lanes(_inputs_by_unknowns, without_curves(study), theta, rows=lanes, batch=_BATCH)
+    bare = without_curves(study)
+    batch = bare.batch_size(len(study.curves), most_slots())  # of any lanes: one program
+    J = map_lanes(_inputs_by_unknowns, bare, theta, rows=lanes, batch=batch)
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
     V = _curve_sees(study)
@@ -257,7 +258,7 @@ def _seen_of_curves(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     by number, at the displacements of the study, whatever they measured.
     """
     J = map_lanes(
-        _curves_by_unknowns, study, theta, rows=lanes, batch=study.batch_size(len(lanes), 16)
+        _curves_by_unknowns, study, theta, rows=lanes, batch=study.batch_size(len(lanes), PATHS)
     )
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]

@@ -55,15 +55,9 @@ from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.options import Options
-from jaxtrachea.optimisation.programs import batch_size
+from jaxtrachea.optimisation import batching
 from jaxtrachea.trachea.geometry import Geometry
 
-#: Of lanes computed together on a CPU, bytes by `Study.bytes_per_lane`, and lanes at least: more
-#: are out of the cache before they are read again (docs/evidence/measured.md).
-CACHED, FEWEST = 5 << 20, 16
-#: Lanes, and their bytes, up to which a program is compiled without optimisation
-#: (docs/evidence/measured.md)
-QUICK = 64, 24 << 20
 #: Depth over the radius of the tube beyond which the noise of forces is looked for a share.
 DEEP = 0.1
 #: The table of parameters, or what differs from the defaults of the model, by name.
@@ -229,7 +223,7 @@ class Study:
         Of a level that iterates on a CPU: lanes side by side gain nothing there, wait for the
         slowest of them, and each size is a program of half a minute.
         """
-        return self.model.level.iterates and jax.default_backend() == "cpu"
+        return self.model.level.iterates and batching.on_cpu()
 
     @property
     def bytes_per_lane(self) -> int:
@@ -244,32 +238,29 @@ class Study:
 
     @property
     def most_together(self) -> int:
-        """Lanes worth computing together at most, a power of two; on a CPU not many of long curves.
+        """Lanes worth computing together at most, a power of two (see `optimisation.batching`).
 
-        More are out of the cache before they are read again. Joint studies and other devices have
-        no such limit; 1 where lanes are fitted `one_at_a_time`.
+        Joint studies and other devices have no such limit; 1 where lanes are fitted
+        `one_at_a_time`.
         """
         if self.one_at_a_time:
             return 1
-        if self.joint or jax.default_backend() != "cpu":
+        if self.joint or not batching.on_cpu():
             return 1 << 30
-        return 1 << (max(FEWEST, CACHED // self.bytes_per_lane).bit_length() - 1)
+        return batching.most_in_cache(self.bytes_per_lane)
 
     def batch_size(self, total: int, most: int) -> int:
         """Lanes computed together, of `total`, of `most` and `most_together`: a size of few."""
-        return batch_size(total, min(most, self.most_together))
+        return batching.batch_size(total, min(most, self.most_together))
 
     def unoptimised(self, count: int) -> bool:
         """Whether `count` lanes take less time than it takes to optimise their program.
 
-        Of a program without optimisation a lane takes about three times as long
-        (docs/evidence/measured.md). Joint studies run theirs again and again.
+        Joint studies run theirs again and again.
         """
-        if self.joint or self.one_at_a_time or jax.default_backend() != "cpu":
+        if self.joint or self.one_at_a_time or not batching.on_cpu():
             return False
-        lanes, most = QUICK
-        together = batch_size(max(count, FEWEST), 1 << 30)
-        return together <= lanes and together * self.bytes_per_lane <= most
+        return not batching.worth_optimising(count, self.bytes_per_lane)
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""

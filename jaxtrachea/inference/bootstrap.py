@@ -27,10 +27,9 @@ from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.batching import copied_together
 
 Kind = Literal["parametric", "residual"]
-#: Refits handed to the solver at a time; bounds the memory.
-_AT_ONCE = 4096
 #: Replicates below which the ends of a 95 % interval are not read off.
 FEWEST = 40
 #: Blocks to a curve below which errors are rough, which is said.
@@ -112,10 +111,9 @@ def bootstrap(
     check_block(result.study, block)
     result.study.refuse_joint("the bootstrap")
     seen = predictions(result.study, result.theta)
-    batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
-    one = dataclasses.replace(settings, starts=1, batch=batch, verify=False)
+    one = dataclasses.replace(settings, starts=1, verify=False)
     thetas, usable = [], []
-    together = max(_AT_ONCE // count, 1)
+    together = max(copied_together(result.study.bytes_per_lane) // count, 1)
     for first in range(0, result.lanes, together):
         lanes = np.arange(first, min(first + together, result.lanes))
         drawn = _draw(result, seen, lanes, count, kind, block, settings.seed)

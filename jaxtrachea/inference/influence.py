@@ -35,11 +35,10 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.estimate import hessian
 from jaxtrachea.inference.labels import succeeded
+from jaxtrachea.optimisation.batching import PATHS
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.
 _ALONE = 1e-9
-#: Lanes of a level that iterates together: second derivatives of their paths take memory.
-_TOGETHER = 16
 
 
 class Diagnostics(NamedTuple):
@@ -230,7 +229,7 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
 
     Args:
         result: the fit.
-        batch: lanes computed together; of a level that iterates no more than `_TOGETHER`.
+        batch: lanes computed together; of a level that iterates no more than `PATHS`.
 
     Raises:
         ValueError: no `FitResult`, or `batch` is no whole number.
@@ -238,7 +237,7 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
     check_word("result", result, FitResult)
     check_word("batch", batch, int)
     if result.study.model.level.iterates:
-        batch = min(batch, _TOGETHER)
+        batch = min(batch, PATHS)
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(
         diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,

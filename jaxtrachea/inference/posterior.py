@@ -32,7 +32,8 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
 from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.posterior_start import Start, around_the_draws, around_the_fit, mode
-from jaxtrachea.optimisation.programs import batch_size, program
+from jaxtrachea.optimisation.batching import batch_size
+from jaxtrachea.optimisation.programs import program
 
 #: Steps of each chain before its draws count.
 _WARM_UP = 500

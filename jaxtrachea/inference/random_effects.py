@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import chdtri
 
 #: Specimens below which no spread is estimated.
 FEWEST = 3
@@ -173,6 +172,8 @@ def _maximum(tau2, estimate, covariance, floor) -> tuple[np.ndarray, _Restricted
 
 def _interval(tau2, variance, dof) -> tuple[np.ndarray, np.ndarray]:
     """95 % interval of tau; see `random_effects`."""
+    from scipy.special import chdtri
+
     total = np.maximum(np.sqrt(0.5 * variance * dof), tau2)
     error = total - tau2
     ends = [total * dof / chdtri(dof, p) - error for p in (0.025, 0.975)]

@@ -5,7 +5,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Bool, Float
 
 from jaxtrachea.fitting.verdict import WEAK
@@ -71,8 +70,10 @@ def combinations(
     Returns:
         Names involved; products such as "EI_L k_M^3.02" (none if nothing is determined).
     """
+    from scipy.linalg import null_space as complement
+
     parts = np.flatnonzero(np.any(np.abs(null_space[:, : len(names)]) >= _PART, axis=0))
-    known = scipy.linalg.null_space(null_space[:, parts]).T
+    known = complement(null_space[:, parts]).T
     rows = _echelon(known)
     involved = [names[i] for i in parts]
     products = []

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea.optimisation.batching import batch_size
 from jaxtrachea.optimisation.curvature import Rest
-from jaxtrachea.optimisation.programs import batch_size, cast, program
+from jaxtrachea.optimisation.programs import cast, program
 from jaxtrachea.optimisation.trust_region import (
     FIRST_RADIUS,
     RUNNING,
@@ -27,9 +28,6 @@ from jaxtrachea.optimisation.trust_region import (
 )
 from jaxtrachea.status import FitStatus
 
-#: Starts computed together at most, on a CPU and on another device (docs/evidence/gpu.md), and the
-#: part of the free memory that they may take.
-MOST_SLOTS, MOST_ELSEWHERE, PART_OF_MEMORY = 128, 1024, 0.5
 #: Iterations of a batch between two looks at which are done.
 ROUNDS = 4
 
@@ -48,11 +46,6 @@ class Solved(NamedTuple):
     cost: np.ndarray
     status: np.ndarray
     iterations: np.ndarray
-
-
-def most_slots() -> int:
-    """Starts worth computing together at most on the device that JAX names first."""
-    return MOST_SLOTS if jax.default_backend() == "cpu" else MOST_ELSEWHERE
 
 
 def _advance(tolerances, rounds, objective, start, refill, state):

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
 
 from jaxtrachea._threads import made_once
 from jaxtrachea.files.traces import Traced
@@ -34,15 +33,6 @@ def program(
     return Traced(function, *static, axes=axes, donate=donate, unoptimised=unoptimised)
 
 
-def batch_size(total: int, most: int) -> int:
-    """Lanes computed together: few different sizes, so that few programs are compiled."""
-    return 1 if total == 1 else min(most, max(16, 1 << (total - 1).bit_length()))
-
-
 def cast(tree: Any, dtype) -> Any:
     """Floating-point numpy arrays of a tree in a dtype; others stay."""
-
-    def moves(v):
-        return np.issubdtype(v.dtype, np.floating)
-
-    return jax.tree.map(lambda v: v.astype(dtype, copy=False) if moves(v) else v, tree)
+    return jax.tree.map(lambda v: v.astype(dtype, copy=False) if v.dtype.kind == "f" else v, tree)

@@ -10,7 +10,6 @@ in the order of the lanes.
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Bool, Float, Int
 
 #: Eigenvalue, over the largest, of a lane's scaled matrix that counts as zero.
@@ -106,13 +105,15 @@ def _damping(radius: float, along, values) -> float:
 
     By bisection of its logarithm, in the coordinates where the matrix is diagonal.
     """
+    from scipy.linalg import norm  # of numbers whose squares overflow too
+
     top = max(values[-1], 1e-300)
     values = np.maximum(values, 0)
 
     def length(damping):
-        return scipy.linalg.norm(along / (values + np.exp(damping)))
+        return norm(along / (values + np.exp(damping)))
 
-    low, high = np.log(_SINGULAR * top), np.log(top + scipy.linalg.norm(along) / radius)
+    low, high = np.log(_SINGULAR * top), np.log(top + norm(along) / radius)
     if length(low) > radius:
         for _ in range(60):
             middle = 0.5 * (low + high)

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.special import stdtrit
 
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.cost import weights
@@ -222,6 +221,8 @@ def _of_lane(stored: FitResult, lane: int, curves: tuple[Curve, ...], left: _Lef
         found = left.predicted(out) if len(out) < len(curves) else None
         if found is not None:
             squares.append(_squares(fitted, [curves[t] for t in out], *found, grid))
+    from scipy.special import stdtrit
+
     squares = [v for v in squares if np.isfinite(v).all()]
     n, growth = len(squares), float(stored.effective.growth[lane]) if stored.study.free else 1.0
     if n < MIN_POSITIONS or deepest <= 0:

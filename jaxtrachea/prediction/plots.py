@@ -42,7 +42,7 @@ def draw_compared(folder: Path, compared: Sequence[Compared]) -> dict[str, str]:
 
 def _save(folder: Path, drawings: Mapping[str, Callable[[], Figure]]) -> dict[str, str]:
     with mpl.rc_context(STYLE):
-        return save_each(folder, drawings, bbox_inches="tight")[1]
+        return save_each(folder, drawings)[1]
 
 
 def _panels(curves: Sequence[tuple[CurvePrediction, np.ndarray | None]]) -> Figure:

@@ -47,7 +47,7 @@ def _drawings(findings: AnalysisResults) -> dict[str, Any]:
 
 def _save(folder: Path, drawings: dict[str, Any]) -> tuple[list[Path], dict[str, str]]:
     with mpl.rc_context(STYLE):
-        return save_each(folder, drawings, bbox_inches="tight")
+        return save_each(folder, drawings)
 
 
 def _panels(result: FitResult) -> list[int]:

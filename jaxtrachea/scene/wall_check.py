@@ -11,7 +11,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, KDTree
 
 from jaxtrachea.contact.patches import Patches
 from jaxtrachea.scene.sizes import RADIUS
@@ -230,6 +229,8 @@ def _distance(corners, points):
 
     Triangles of about one size share a tree, so that a few large ones do not widen every search.
     """
+    from scipy.spatial import KDTree
+
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
     size = np.ceil(np.log2(np.maximum(reach / reach.max(), 2.0**-SIZES))).astype(int)
@@ -276,6 +277,8 @@ def _away(corners, points):
 
 def _sharp_gap(patches: Patches, points):
     """Signed distance of points to the union of the patches, and which patch is the nearest."""
+    from scipy.spatial import ConvexHull
+
     cores = np.asarray(patches.shapes.vertices, float).transpose(0, 2, 1)
     radius = np.asarray(patches.shapes.radius, float)
     hulls = [ConvexHull(core) for core in cores]

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Scene
@@ -108,6 +107,8 @@ def spread(joints: np.ndarray, x: np.ndarray, at: np.ndarray, length: float) -> 
 
 def remesh(moved: np.ndarray, mesh: Mesh, fine: Mesh) -> np.ndarray:
     """Displacements on a made tube's grid, bilinear at the vertices of another; (rows, n, 3)."""
+    from scipy.interpolate import RegularGridInterpolator
+
     s, phi = (np.asarray(v, float) for v in (mesh.s, mesh.phi))
     lines = np.unique(s)
     around = len(s) // len(lines)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
-from scipy.special import fdtrc
 
 from jaxtrachea.measurements.curve import Curve
 
@@ -85,6 +84,8 @@ class Comparison(NamedTuple):
 
 def compare(stack: Stack) -> Comparison:
     """Trials of each group against each other, over the displacements that all have."""
+    from scipy.special import fdtrc
+
     first, starts = stack.first, stack.starts
     low = np.minimum.reduceat(stack.displacement, starts)
     high = np.maximum.reduceat(stack.displacement, starts)

@@ -1,17 +1,20 @@
-"""Times of two checkouts in turns: the shipped fit, and a table of many specimens.
+"""Times of two checkouts in turns: shipped fit and scene, and a table of many specimens.
 
-    python tests/bench/turns.py BEFORE AFTER [--rounds 7] [--specimens 2000] [--label NAME]
+    python tests/bench/turns.py BEFORE AFTER [--rounds 7] [--cold 3] [--specimens 2000]
+        [--label NAME]
 
-Each sample is the command `fit` in a fresh process with the programs that a first one kept (a
-cache folder for each checkout, emptied at the end). Samples are taken in turns, and the first of a
-pair alternates (A B, B A, ...). Given are wall seconds and processor seconds (user and system, of
-all cores), which a busy machine moves less, medians, and the ratio of medians, after over before.
+Each sample is a command in a fresh process with the programs that a first one kept (a cache folder
+for each checkout, emptied at the end), or, of the cold ones, with an empty cache. All find compiled
+Python. Samples are taken in turns, and the first of a pair alternates (A B, B A, ...). Given are
+wall seconds and processor seconds (user and system, of all cores), which a busy machine moves less,
+medians, and the ratio of medians, after over before.
 The specimens are those of situations.py, clean, four positions of 60 samples.
-`--specimens 0` leaves them out. Rows go to results/turns.jsonl under NAME, others stay there.
+`--specimens 0`, `--cold 0` leave out. Rows go to results/turns.jsonl under NAME, others stay there.
 """
 
 import argparse
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -24,7 +27,7 @@ import numpy as np
 import presses
 import situations
 
-SHIPPED = "fits/virtual_trachea/fit.toml"
+SHIPPED, SCENE = "fits/virtual_trachea/fit.toml", "configs/normal.toml"
 
 
 def write_cohort(folder: Path, count: int) -> Path:
@@ -41,19 +44,21 @@ def write_cohort(folder: Path, count: int) -> Path:
     return folder / "spec.toml"
 
 
-def timed(package: Path, spec: Path, base: Path, cache: Path) -> tuple[float, float]:
-    """Wall and processor seconds of one `fit`.
+def timed(package: Path, what: tuple[str, Path], base: Path, cache: Path) -> tuple[float, float]:
+    """Wall and processor seconds of one command, named with its file.
 
     Raises:
         RuntimeError: it ended with a code that is neither 0 nor 1 (some specimen failed).
     """
     with tempfile.TemporaryDirectory(dir=base) as out, open(base / "messages", "w+") as messages:
-        command = [sys.executable, "-m", "jaxtrachea", "fit", str(spec), "--out", f"{out}/out"]
+        command = [sys.executable, "-m", "jaxtrachea", what[0], str(what[1]), "--out", f"{out}/out"]
+        environment = presses.environment(package, cache)
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        environment["PYTHONPYCACHEPREFIX"] = str(base / "compiled")
         begin = time.perf_counter()
         process = subprocess.Popen(
-            command, cwd=out, env=presses.environment(package, cache), stdout=messages,
-            stderr=messages,
-        )  # fmt: skip
+            command, cwd=out, env=environment, stdout=messages, stderr=messages
+        )
         _, status, usage = os.wait4(process.pid, 0)
         wall = time.perf_counter() - begin
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -63,13 +68,16 @@ def timed(package: Path, spec: Path, base: Path, cache: Path) -> tuple[float, fl
     return wall, usage.ru_utime + usage.ru_stime
 
 
-def compare(case: str, specs: dict[str, Path], packages: dict[str, Path], base: Path, rounds: int):
+def compare(case: str, command: str, specs: dict[str, Path], packages, base: Path, rounds: int):
     """A row of all samples of a case, and its ratios; the first run of each keeps its programs."""
     samples = {name: [] for name in packages}
     order = list(packages)
     for i in range(rounds + 1):
         for name in order:
-            found = timed(packages[name], specs[name], base, base / f"cache_{name}")
+            cache = base / f"cache_{name}"
+            if case.endswith("cold"):
+                shutil.rmtree(cache, ignore_errors=True)
+            found = timed(packages[name], (command, specs[name]), base, cache)
             if i:
                 samples[name].append(found)
             print(
@@ -85,24 +93,35 @@ def compare(case: str, specs: dict[str, Path], packages: dict[str, Path], base: 
 
 
 def main() -> None:
-    """Both cases, and a table."""
+    """All cases, and a table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--cold", type=int, default=3)
     parser.add_argument("--specimens", type=int, default=2000)
     parser.add_argument("--label", default="", help="left out: nothing is written")
     asked = parser.parse_args()
     packages = {"before": asked.before.resolve(), "after": asked.after.resolve()}
     with tempfile.TemporaryDirectory() as name:
         base = Path(name)
-        cases = {"shipped fit": {name: path / SHIPPED for name, path in packages.items()}}
+        fit = {name: path / SHIPPED for name, path in packages.items()}
+        scene = {name: path / SCENE for name, path in packages.items()}
+        cases = [
+            ("shipped fit", "fit", fit, asked.rounds),
+            ("shipped scene", "simulate", scene, asked.rounds),
+            ("shipped fit, cold", "fit", fit, asked.cold),
+        ]
         if asked.specimens:
-            spec = write_cohort(base, asked.specimens)
-            cases[f"{asked.specimens} specimens"] = dict.fromkeys(packages, spec)
-        rows = [compare(case, specs, packages, base, asked.rounds) for case, specs in cases.items()]
+            spec = dict.fromkeys(packages, write_cohort(base, asked.specimens))
+            cases.append((f"{asked.specimens} specimens", "fit", spec, asked.rounds))
+        rows = [
+            compare(case, command, specs, packages, base, rounds)
+            for case, command, specs, rounds in cases
+            if rounds
+        ]
     lines = []
     for row in rows:
         row["commits"] = {name: common.commit(path) for name, path in packages.items()}

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.special import stdtrit
 
 from jaxtrachea.files.table import Column, Row, Table, ends, number
 from jaxtrachea.inference.analysis import (
@@ -49,6 +48,8 @@ def _compute(request: Request, findings: AnalysisResults, progress: Progress) ->
 
 def population_rows(of: Population) -> Iterator[Cells]:
     """One row per parameter for population.csv; intervals with Student's t."""
+    from scipy.special import stdtrit
+
     e = of.effects
     for j, p in enumerate(of.parameters):
         count = int(of.known[:, j].sum())

@@ -10,10 +10,8 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.batching import PATHS
 from jaxtrachea.optimisation.programs import program
-
-#: Presses of a level that iterates that are computed at a time.
-_TOGETHER = 16
 
 
 def of_a_new_press(
@@ -139,7 +137,7 @@ def press_informations(
     sides = study.lanes.side_force is not None
     run = program(_information, study.model, samples, sides, axes=(None, 0))
     count = len(places.s)
-    together = _TOGETHER if study.model.level.iterates else count
+    together = PATHS if study.model.level.iterates else count
     parts = []
     for first in range(0, count, together):
         row = np.minimum(np.arange(first, first + together), count - 1)
