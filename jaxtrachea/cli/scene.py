@@ -77,6 +77,8 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     staged, choice = _chosen(scene, spec, staged)
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
+        if spec.output.surface:
+            load_beside("trimesh")
         if spec.output.pictures:
             load_beside("jaxtrachea.scene.plots")
         out = jax.block_until_ready(Traced(run)(staged.scene, staged.material, staged.path))

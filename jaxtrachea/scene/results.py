@@ -7,7 +7,6 @@ import h5py
 import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
-from jaxtrachea.files.surfaces import write_glb, write_ply
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -78,14 +77,16 @@ def _head(file: h5py.File, provenance: dict, plan: Plan) -> None:
 
 def write_meshes(folder: Path, scene: Scene, out: Simulation) -> None:
     """The last solved row's surface as deformed.ply (mm) and deformed.glb (m, as GLB wants)."""
+    import trimesh  # slow to load, only for files
+
     if out.vertices is None or scene.mesh is None:
         return
     row = last_solved(out)
     if row is None:
         return
     vertices, faces = np.asarray(out.vertices[row], float), np.asarray(scene.mesh.faces)
-    write_ply(folder / "deformed.ply", vertices, faces)
-    write_glb(folder / "deformed.glb", 1e-3 * vertices, faces)
+    for name, scale in (("deformed.ply", 1.0), ("deformed.glb", 1e-3)):
+        trimesh.Trimesh(vertices * scale, faces, process=False).export(folder / name)
 
 
 def last_solved(out: Simulation) -> int | None:
