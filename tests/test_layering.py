@@ -317,7 +317,7 @@ LOADS = {
     "fit": (["fit", FIT], READS | {"scipy", "scipy.special", "matplotlib", "PIL"}),
     "simulate": (
         ["simulate", SCENE],
-        READS | {"scipy", "scipy.spatial", "scipy.special", "matplotlib", "PIL"},
+        READS | {"scipy", "scipy.spatial", "scipy.special", "matplotlib", "PIL", "trimesh"},
     ),
 }
 

@@ -1,0 +1,162 @@
+"""Fits of records in time: residual and Jacobian against the press, bounds, what is refused."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from late import late
+
+from jaxtrachea.fitting import forward_residual
+from jaxtrachea.fitting.few_samples import serves
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.residual import of_press, of_trials, residual, residual_value
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.press import press
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+GEOMETRY = Geometry.create(160.0, list(np.arange(10.0, 151.0, 10.0)))
+MATERIAL = Material(EI_L=20.0, k_M=0.3, k_1=0.6, k_3=0.05, e_1=0.05, e_2=0.002)
+GAMMA, TAU = np.array([0.9, 0.5]), np.array([0.36, 4.3])
+#: Rest, ramp, hold, unloading until the tool is off, rest, and a shallower press.
+CORNERS = np.array([0.0, 1.0, 3.0, 13.0, 13.5, 16.0, 18.0, 20.0])
+WAY = np.array([-0.2, 0.0, 3.0, 3.0, -0.5, -0.5, 2.0, 2.0])
+
+
+def clock(count=60):
+    """Corners, and more samples where a hold begins."""
+    rng = np.random.default_rng(1)
+    return np.unique(np.r_[CORNERS, 3 + np.geomspace(0.01, 9, 20), rng.uniform(0, 20, count)])
+
+
+def march(time, elastic, gamma):
+    """Step by step, each exact for an elastic force that is straight; the tool does not pull."""
+    h, before, out = np.zeros(gamma.size), 0.0, []
+    for dt, e in zip(np.diff(time, prepend=time[0] - 1e-9), elastic, strict=True):
+        x = dt / TAU
+        kept, share = np.exp(-x), -gamma * np.expm1(-x) / x
+        e = max(e, -np.sum(kept * h - share * before) / (1 + share.sum()))
+        h = kept * h + share * (e - before)
+        before = e
+        out.append(max(e + h.sum(), 0.0))
+    return np.array(out)
+
+
+def curve(s, trial="a", options=Options(), gamma=GAMMA, noise=0.0, **more):
+    """The elastic press, relaxed."""
+    t = clock()
+    D = np.interp(t, CORNERS, WAY)
+    elastic = press(GEOMETRY, MATERIAL, s, D, dataclasses.replace(options, relaxation="off"))
+    force = march(t, np.asarray(elastic.force), gamma)
+    force = force + np.random.default_rng(int(s)).normal(0, noise, t.size)
+    rise = (0, int(np.searchsorted(t, 3.0)) + 1)
+    return Curve("s", trial, s, 0.0, D, force, time=t, rise=rise, **more)
+
+
+RELAXING = Options(relaxation="uniform")
+KINDS = {
+    "line": (RELAXING, False),
+    "markers": (RELAXING, True),
+    "softening": (dataclasses.replace(RELAXING, skeleton="softening"), True),
+    "bonded": (dataclasses.replace(RELAXING, contact="bonded"), True),
+    "fung": (dataclasses.replace(RELAXING, branches="fung"), False),
+}
+
+
+def point_of(study, seed=3):
+    guess = np.array([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]])
+    return jnp.asarray(guess + 0.2 * np.random.default_rng(seed).normal(size=guess.size))
+
+
+@pytest.mark.parametrize("kind", [*list(KINDS)[:3], *late(*list(KINDS)[3:])])
+def test_residual_is_that_of_the_press_in_time(kind):
+    """In closed form beside `press_in_time` in forward mode, through lift-off."""
+    options, marked = KINDS[kind]
+    rings = {}
+    if marked:
+        moved = np.full((clock().size, 2), 0.1)
+        rings = {"joint_rings": np.array([2, 7]), "joint_displacement": moved}
+    curves = [curve(28.0, **rings), curve(62.0, "b", **rings)]
+    more = {"onset": {}} if kind == "line" else {}
+    study = build_study(curves, GEOMETRY, options, more, noise=Noise(force=0.01, joints=0.1))
+    lane = jax.tree.map(lambda v: jnp.asarray(v[0]), study.lanes)
+    if lane.blend is not None:
+        assert (np.asarray(lane.blend) > 0).all()
+
+    @jax.jit
+    def both(theta, lane):
+        free = of_trials(study.model, theta, lane)
+        plain = forward_residual.residual(study.model, free, of_press(lane), study.model.geometry)
+        return (
+            residual(study.model, theta, lane)[:2],
+            residual_value(study.model, theta, lane),
+            plain,
+        )
+
+    (value, jacobian), alone, (plain, slopes) = both(point_of(study), lane)
+    assert np.isfinite(plain).all()
+    np.testing.assert_allclose(value, plain, rtol=1e-11, atol=1e-9)
+    np.testing.assert_allclose(alone, plain, rtol=1e-11, atol=1e-9)
+    np.testing.assert_allclose(jacobian, slopes, rtol=1e-7, atol=1e-7 * np.abs(slopes).max())
+
+
+def test_truth_is_found_again():
+    """Of two positions, noise of 0.3 %: strengths and times as they are, none on a bound."""
+    table = {n: {"fixed": True, "value": float(getattr(MATERIAL, n))} for n in ("EI_L", "k_M")}
+    curves = [curve(s, t, noise=0.004) for s, t in ((28.0, "a"), (62.0, "b"))]
+    study = build_study(curves, GEOMETRY, RELAXING, table | {"k_1": {}, "k_3": {}})
+    result = fit(study, Settings())
+    truth = {"k_1": 0.6, "k_3": 0.05, "gamma_1": 0.9, "gamma_2": 0.5, "tau_1": 0.36}
+    truth["tau_ratio_2"] = TAU[1] / TAU[0]
+    for i, (p, _, _) in enumerate(study.unknowns[0]):
+        if p.name in truth:
+            error = np.log(result.value[0, i] / truth[p.name])
+            assert abs(error) < 4 * result.relative_se[0, i] + 1e-3, p.name
+    assert result.rms[0, 0] == pytest.approx(0.004, rel=0.15)
+    assert not result.at_bound.any()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_times_and_bounds_go_with_the_records(scale):
+    """Of records so many times as long: first guesses, bounds and shared programs."""
+    first = curve(28.0)
+    study = build_study([first], GEOMETRY, RELAXING)
+    longer = dataclasses.replace(first, time=first.time * scale)
+    other = build_study([longer], GEOMETRY, RELAXING)
+    assert other.model == study.model
+    for p, q in zip(study.parameters, other.parameters, strict=True):
+        if p.name == "tau_1":
+            found = (q.value, q.lower, q.upper)
+            np.testing.assert_allclose(found, np.array([p.value, p.lower, p.upper]) * scale)
+            assert p.lower == pytest.approx(np.diff(first.time).min() / 3)
+            assert p.upper == pytest.approx(3 * 20)
+        else:
+            assert (p.value, p.lower) == pytest.approx((q.value, q.lower))
+
+
+def test_what_the_user_says_of_a_time_stays():
+    study = build_study([curve(28.0)], GEOMETRY, RELAXING, {"tau_1": {"value": 0.5, "lower": 0.4}})
+    tau = next(p for p in study.parameters if p.name == "tau_1")
+    assert (tau.value, tau.lower) == (0.5, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [(None, "has no time"), (np.zeros(clock().size), "does not run"), (-clock(), "does not run")],
+)
+def test_a_curve_without_a_time_is_refused(time, message):
+    other = dataclasses.replace(curve(28.0), time=time)
+    with pytest.raises(ValueError, match=message):
+        build_study([other], GEOMETRY, RELAXING)
+
+
+def test_a_few_samples_say_nothing_of_a_past():
+    study = build_study([curve(28.0)], GEOMETRY, RELAXING)
+    many = dataclasses.replace(study, lanes=study.lanes)
+    assert not serves(many, Settings(), 10_000)
