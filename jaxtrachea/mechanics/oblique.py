@@ -286,7 +286,7 @@ def slide_at(
 
 
 def _rubbed(place: Place, displacement: Float[Array, "n 3"], friction: Coulomb, options):
-    """Displacements and compliance in the frame of the contact, friction to compute with, status."""
+    """Displacements and compliance in the contact's frame, friction to compute with, refusals."""
     mu = jnp.asarray(friction.mu)
     friction = Coulomb(jnp.where(mu >= 0, mu, 0), friction.rounding)
     refused = jnp.where(jnp.isnan(mu), PressStatus.NON_FINITE, place.asked.refused)

@@ -151,7 +151,7 @@ class Session:
 
     @property
     def state(self) -> State:
-        """What the next step begins with, as numpy arrays: to save, restore, branch, or `step` on.
+        """What the next step begins with: to save, restore or branch, or to `step` on from.
 
         A state that is given back goes on to the bit as it did. The force that was held is not in
         it: `force_or_last` is zeros until the next step. One of another scene, tool or version is
@@ -159,7 +159,8 @@ class Session:
         """
         with self._lock:
             numbers, scene = np.array(self._program.state), self.scene
-        return dataclasses.replace(self._states.views(numbers), origin=origin_of(scene))
+        state = jax.tree.map(jnp.array, self._states.views(numbers))
+        return dataclasses.replace(state, origin=origin_of(scene))
 
     @state.setter
     def state(self, state: State) -> None:

@@ -5,7 +5,6 @@ body of `lax.scan`. `Session` is the compiled loop over it.
 """
 
 import dataclasses
-import functools
 import hashlib
 from typing import Any, NamedTuple
 
@@ -126,7 +125,9 @@ def step(
             raise ValueError(f"{name} is {v.dtype}; expected {dtype}, as the scene has")
     if not isinstance(rotation, Tracer):
         check_rotations("rotation", np.asarray(rotation)[None])
-    return _step(scene, material, state, rotation, translation)
+    given = scene, material, state, rotation, translation
+    traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(given))
+    return _step(*given) if traced else _compiled(*given)
 
 
 def check_scene(scene: Scene, material: AnyMaterial) -> None:
@@ -257,9 +258,12 @@ class Numbers:
         return self.states.pack(moved[0]), *moved[1:]
 
 
-@functools.partial(jax.jit, inline=True)
 def _step(scene: Scene, material: AnyMaterial, state: State, rotation, translation):
-    """`step`, of arguments that are checked: by the program of a `Session`, to the bit."""
+    """`step`, of arguments that are checked: by the program of a `Session`.
+
+    To the bit, if the scene is no argument of the compiled function: its arrays are constants there
+    as here, and those that may change are none (hence the barrier).
+    """
     given = changeable(scene, material)
     numbers = Numbers(scene, given, state)
     row = Row(scene, numbers.setting, numbers.step)
@@ -270,6 +274,9 @@ def _step(scene: Scene, material: AnyMaterial, state: State, rotation, translati
         jax.lax.optimization_barrier(numbers.given.pack(given)),
     )
     return numbers.states.unpack(state), result
+
+
+_compiled = jax.jit(_step)
 
 
 @full_precision
