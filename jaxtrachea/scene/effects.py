@@ -60,7 +60,7 @@ def _friction(case: Case) -> Verdict:
     moves = facts.slip > 0
     reason = "the tool moves along the surface"
     if not moves:
-        reason = "no motion along the surface; a hand that slides wants 'on'"
+        reason = "no motion along the surface"
     elif cannot:
         reason = f"{cannot}; the tool {'holds the surface' if fixed else 'slides freely'}"
     return _switch(moves and not cannot, reason, cannot)

@@ -7,7 +7,8 @@ point both give the same numbers. Beyond it the place follows the contact.
 
 The normal part of the press goes with the way along the normal of the place. Where that differs
 from the depth of the tool by more than half of it (round the tube), it gives way, so that the force
-is 0 where the tool leaves the tube. A step longer than the tube is thick, or along the surface than
+is 0 where the tool leaves the tube. The point of the tool that holds stays within the depth of the
+contact: a tool that rolls or spins takes another one, pressed straight in. A step longer than the tube is thick, or along the surface than
 the dent is wide, is no path: the tool touches anew, straight in.
 """
 
@@ -58,10 +59,17 @@ def rub(
     teleported = teleported | (state.touching & has_left(scene, state.anchor, last, here))
     on = state.touching & hit & ~teleported
     followed = follow(scene, state.anchor, here, most)
-    anchor = pick(teleported, anchor_at(scene, here), pick(on, followed, first))
+    # To the bit where it was, if it did not follow: a tool that sticks has no slip at all.
+    follows = jnp.any(followed.point != state.anchor.point)
+    followed = pick(follows, followed, state.anchor)
+    now = anchor_at(scene, here)
+    anchor = pick(teleported, now, pick(on, followed, first))
     way = press_vector(scene, anchor, here.path)
     mismatch = MAX_MISMATCH * jnp.where(hit, depth, jnp.inf)
     inward = jnp.clip(way[0], depth - mismatch, depth + mismatch)
+    rolled = now.body - anchor.body
+    share = 1 - limit(jnp.where(hit, depth, 0), length(rolled))
+    inward = inward + share * (depth - inward)
     way = jnp.concatenate([inward[None], way[1:]])
     slip = pick(on, _behind(scene, state, followed), no_slip(way.dtype))
     slip = _within(slip, way[1:], most)
@@ -72,6 +80,7 @@ def rub(
     path, slid = slide_at(place, product(frame.T, way), coulomb, scene.plan.oblique)
     total = slip._replace(held=slip.held + slid)
     nothing = jnp.zeros(1, way.dtype)
+    held = anchor._replace(body=anchor.body + share * rolled)
 
     def solve(presses: Presses) -> Moved:
         refused = jnp.isnan(jnp.sum(presses.displacement, axis=1))
@@ -82,7 +91,7 @@ def rub(
 
     return Grip(
         anchor=anchor,
-        after=re_anchor(scene, anchor, way - jnp.concatenate([nothing, slid]), here.path),
+        after=re_anchor(scene, held, way - jnp.concatenate([nothing, slid]), here.path),
         touching=hit,
         way=way + jnp.concatenate([nothing, slip.held]),
         solve=solve,

@@ -5,7 +5,6 @@ compiled when the session is made; a step compiles nothing. State and result go 
 array each (`one_row`).
 """
 
-import copy
 import dataclasses
 import threading
 import time
@@ -172,8 +171,9 @@ class Session:
 
     def __deepcopy__(self, memo: dict) -> "Session":
         """One that goes on from the same state by the same program."""
-        new = copy.copy(self)
+        new = object.__new__(Session)
         with self._lock:
+            vars(new).update(vars(self))
             new._program, new._lock = self._program.copy(), threading.Lock()
             new._seconds = self._seconds.copy()
         return new

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._arguments import check_word, shaped
+from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import full_precision
 from jaxtrachea._packed import Packing
 from jaxtrachea.contact.pose import check_rotations
@@ -92,8 +92,8 @@ def step(
     scene: Scene,
     material: AnyMaterial,
     state: State,
-    rotation: Float[Array, "3 3"],
-    translation: Float[Array, "3"],
+    rotation: ArrayLike,
+    translation: ArrayLike,
 ) -> tuple[State, Simulation]:
     """Move the tool: the next state, and what happens at this pose.
 
@@ -105,8 +105,9 @@ def step(
         scene: that the state was made for.
         material: may change from step to step.
         state: from `init_state`, or of the step before.
-        rotation: of the tool, orthogonal with determinant 1 (checked where it is not traced).
-        translation: of its origin, mm.
+        rotation: of the tool, orthogonal with determinant 1 (checked where it is not traced);
+            shape (3, 3).
+        translation: of its origin, mm; shape (3,).
 
     Returns:
         The next `State`, and a `Simulation` without the axis of rows.
