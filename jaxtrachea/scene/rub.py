@@ -8,8 +8,9 @@ point both give the same numbers. Beyond it the place follows the contact.
 The normal part of the press goes with the way along the normal of the place. Where that differs
 from the depth of the tool by more than half of it (round the tube), it gives way, so that the force
 is 0 where the tool leaves the tube. The point of the tool that holds stays within the depth of the
-contact: a tool that rolls or spins takes another one, pressed straight in. A step longer than the tube is thick, or along the surface than
-the dent is wide, is no path: the tool touches anew, straight in.
+contact: a tool that rolls or spins takes another one, pressed straight in. A step longer than the
+tube's radius, or along the surface than the dent is wide, is no path: the tool touches anew,
+straight in.
 """
 
 from typing import Any

@@ -112,7 +112,8 @@ class Session:
         given, state = changeable(self.scene, self.material), init_state(self.scene, self.material)
         row = Numbers(self.scene, given, state)
         self._given, self._states = row.given, row.states
-        self._numbers = jax.device_put(row.given.fill(given))
+        self._kept, self._filled = given, row.given.fill(given)
+        self._numbers = jax.device_put(self._filled.copy())
         self._start = row.states.fill(state)
         pose = np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype)
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
@@ -174,6 +175,7 @@ class Session:
         new = object.__new__(Session)
         with self._lock:
             vars(new).update(vars(self))
+            new._filled = self._filled.copy()
             new._program, new._lock = self._program.copy(), threading.Lock()
             new._seconds = self._seconds.copy()
         return new
@@ -248,7 +250,10 @@ class Session:
             self._begin_anew()
 
     def _change(self, scene: Scene, material: AnyMaterial) -> None:
-        self._numbers = jax.device_put(self._given.fill(changeable(scene, material)))
+        given = changeable(scene, material)
+        self._given.refill(self._filled, self._kept, given)
+        self._numbers = jax.device_put(self._filled.copy())
+        self._kept = given
         self.scene, self.material = scene, material
 
     def _begin_anew(self) -> None:
