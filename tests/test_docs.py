@@ -188,7 +188,22 @@ def _sensitivity(out):
 
 
 #: What a block must have printed.
+def _at_rest(out):
+    """The damping is that of a soft wall, and the wall carries what the hand pushes with."""
+    damping = float(re.search(r"least damping (\S+) N s/m", out)[1])
+    force = float(re.search(r"at rest: (\S+) N", out)[1])
+    assert 0.01 < damping < 0.5
+    assert force == pytest.approx(-0.3, rel=0.02)
+
+
+def _learned(out):
+    before, after = map(float, re.search(r"miss (\S+) to (\S+) N", out).groups())
+    assert after < before / 4
+
+
 FINDS = {
+    ("haptics", 1): _at_rest,
+    ("haptics", 2): _learned,
     ("layer", 0): _press,
     ("layer", 1): _at_three_places,
     ("layer", 2): _too_stiff,

@@ -22,6 +22,7 @@ from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import hidden_rows, hide, refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
 from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.material import Material
 
 
 class Simulation(NamedTuple):
@@ -161,6 +162,7 @@ def pressed(
     force, moment, solved = moved.force, None, moved.status
     of_joints = plan.mechanics.hangs_on_rings
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:
+        assert isinstance(material, Material)
         force, moment = force_by_pose(scene, material, path, used, moved, made)
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)

@@ -268,13 +268,13 @@ def _step(scene: Scene, material: AnyMaterial, state: State, rotation, translati
     given = changeable(scene, material)
     numbers = Numbers(scene, given, state)
     row = Row(scene, numbers.setting, numbers.step)
-    state, result = row(
+    packed, result = row(
         numbers.states.pack(state),
         rotation,
         translation,
         jax.lax.optimization_barrier(numbers.given.pack(given)),
     )
-    return numbers.states.unpack(state), result
+    return numbers.states.unpack(packed), result
 
 
 _compiled = jax.jit(_step)
