@@ -124,8 +124,10 @@ class OneRow:
 
     def __call__(self, *given: Any) -> Simulation:
         """The finished result: numpy arrays, and `LARGE` on the device."""
-        self.state, packed, large = self._run(self.state, self._free(), *given)
-        self._sets.append(large)
+        free = self._free() if self._shapes else ()
+        self.state, packed, large = self._run(self.state, free, *given)
+        if large:
+            self._sets.append(large)
         contact = self._contacts.leaves(np.asarray(packed))  # waits for all of them
         return Simulation._make(self.fusion((*contact, *large, None)))
 

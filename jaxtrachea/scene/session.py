@@ -224,8 +224,9 @@ class Session:
         """
         if not isinstance(material, Material):
             raise ValueError(f"material is {type(material).__name__}; expected a Material")
-        check_material(self.scene.geometry, material)
-        check_alike(material, self._given.like.material, "make a new Session")
+        if not _same_kind(material, self.material):
+            check_material(self.scene.geometry, material)
+            check_alike(material, self._given.like.material, "make a new Session")
         with self._lock:
             self._change(self.scene, material)
 
@@ -281,3 +282,13 @@ class Session:
             steps=len(taken), median=float(median), p99=float(p99), worst=float(taken.max()),
             edges=edges, counts=counts,
         )  # fmt: skip
+
+
+def _same_kind(new: Material, old: AnyMaterial) -> bool:
+    """Whether no value of one has another shape or dtype than in the other, which was checked."""
+    was = vars(old)
+    return all(
+        v is was[name] or (isinstance(v, jax.Array) and isinstance(was[name], jax.Array)
+                           and v.shape == was[name].shape and v.dtype == was[name].dtype)
+        for name, v in vars(new).items()
+    )  # fmt: skip

@@ -15,16 +15,18 @@ import threading
 import time
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from small_scenes import BALL, BARE, MATERIAL, OUTER, TUBE, ball
-from tool_ways import closed_loop, random_way
 
-import jaxtrachea as jt
-from jaxtrachea.scene.stage import Tool
-from jaxtrachea.trachea.tube import make_tube
+jax.config.update("jax_enable_x64", True)  # before the scenes are made
 
-jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from small_scenes import BALL, BARE, MATERIAL, OUTER, TUBE, ball  # noqa: E402
+from tool_ways import closed_loop, random_way  # noqa: E402
+
+import jaxtrachea as jt  # noqa: E402
+from jaxtrachea.scene.stage import Tool  # noqa: E402
+from jaxtrachea.trachea.tube import make_tube  # noqa: E402
+
 EYE = np.eye(3)
 RUBBED = dataclasses.replace(
     BARE, contact_point="fixed", friction="on", axial="on", second_plane="on", want_joints=False,
@@ -39,7 +41,7 @@ def scene(**how):
     return jt.make_scene(TUBE, MATERIAL, start, tool=Tool(BALL, 0.66), mesh=mesh, effects=effects)
 
 
-def environments(count: int = 1000, steps: int = 50) -> None:
+def environments(count: int = 1000, steps: int = 12) -> None:
     """Time and memory for each, and the largest difference from single ones."""
     made = scene()
     ways = [random_way(steps, OUTER, seed) for seed in range(count)]
@@ -60,6 +62,7 @@ def environments(count: int = 1000, steps: int = 50) -> None:
 
     program = run.lower(states, rotation, translation).compile()
     memory = program.memory_analysis()
+    assert memory is not None
     begin = time.perf_counter()
     force, status = jax.block_until_ready(program(states, rotation, translation))
     taken = time.perf_counter() - begin
