@@ -52,6 +52,9 @@ from .scene.stage import Poses as Poses
 from .scene.stage import Presses as Presses
 from .scene.stage import Scene as Scene
 from .scene.stage import Tool as Tool
+from .scene.step import State as State
+from .scene.step import init_state as init_state
+from .scene.step import step as step
 from .scene.sweep import sweep as sweep
 from .status import FitStatus as FitStatus
 from .status import PredictionStatus as PredictionStatus

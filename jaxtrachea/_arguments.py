@@ -43,6 +43,8 @@ def real(name: str, value: Any, dtype=None) -> Array:
         if type(value) is np.ndarray:
             # Of a copy, that the caller cannot change; `jnp.asarray` compiles for every shape.
             array = jax.device_put(np.array(value))
+        elif isinstance(value, Array):
+            array = value
         else:
             array = jnp.asarray(float(value) if number else value)
     except (TypeError, ValueError, OverflowError):

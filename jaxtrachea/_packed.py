@@ -72,6 +72,13 @@ class Packing:
             numbers[part.numbers].reshape(part.shape)[...] = np.asarray(v)
         return numbers
 
+    def refill(self, numbers: Float[np.ndarray, " numbers"], old: Any, new: Any) -> None:
+        """Change numbers of `old` into those of `new`: only where its arrays are others."""
+        given = map(self._tree.flatten_up_to, (old, new))
+        for part, was, v in zip(self._parts, *given, strict=True):
+            if v is not was:
+                numbers[part.numbers].reshape(part.shape)[...] = np.asarray(v)
+
     def unpack(self, numbers: Float[Array, " numbers"]) -> Any:
         """The tree again (traced)."""
         leaves = []

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 #: What a user reads, in this order.
-PATH = ["install", "fit", "read_a_fit", "after_a_fit", "simulate", "layer"]
+PATH = ["install", "fit", "read_a_fit", "after_a_fit", "simulate", "layer", "haptics"]
 #: Commands that are shown without a placeholder, and the test that runs each.
 RUN_BY = {
     "--version": "test_cli.py",
@@ -76,7 +76,11 @@ tool, pose = sphere(2.0), pose_from_vector(jnp.zeros(3), jnp.array([75.0, 15.0, 
 """,
 }
 #: Blocks that take longer than the default suite allows, and those that other tests run.
-SLOW = {("layer", i) for i in (2, 3, 4, 5)} | {("contact", 0), ("contact", 1)}
+SLOW = (
+    {("layer", i) for i in (2, 3, 4, 5)}
+    | {("haptics", i) for i in range(3)}
+    | {("contact", 0), ("contact", 1)}
+)
 ELSEWHERE = {("README", 0): "test_readme.py", ("after_a_fit", 0): "test_docs.py"}
 
 
@@ -184,7 +188,22 @@ def _sensitivity(out):
 
 
 #: What a block must have printed.
+def _at_rest(out):
+    """The damping is that of a soft wall, and the wall carries what the hand pushes with."""
+    damping = float(re.search(r"least damping (\S+) N s/m", out)[1])
+    force = float(re.search(r"at rest: (\S+) N", out)[1])
+    assert 0.01 < damping < 0.5
+    assert force == pytest.approx(-0.3, rel=0.02)
+
+
+def _learned(out):
+    before, after = map(float, re.search(r"miss (\S+) to (\S+) N", out).groups())
+    assert after < before / 4
+
+
 FINDS = {
+    ("haptics", 1): _at_rest,
+    ("haptics", 2): _learned,
     ("layer", 0): _press,
     ("layer", 1): _at_three_places,
     ("layer", 2): _too_stiff,

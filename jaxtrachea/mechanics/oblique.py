@@ -25,7 +25,7 @@ from jaxtrachea.mechanics.admission import (
     status_of,
 )
 from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.friction import Coulomb
+from jaxtrachea.mechanics.friction import Coulomb, Slide
 from jaxtrachea.mechanics.press import Options, check_line, local_law, read_values, touch
 from jaxtrachea.mechanics.skeleton import Rings, Skeleton, local_frame
 from jaxtrachea.status import PressStatus, RingStatus
@@ -265,19 +265,44 @@ def _press_path(
     options: ObliqueOptions,
 ) -> ObliquePath:
     """`press_path`, of arguments that are checked."""
-    asked, unit, law, phi_c, onset = place_at(geometry, material, s_c, phi_c, options, onset=onset)
+    place = place_at(geometry, material, s_c, phi_c, options, onset=onset)
+    D, C, friction, refused = _rubbed(place, displacement, friction, options)
+    height = jnp.where(place.onset >= 0, place.onset, 0)
+    slid = _friction.slide_path(D, C, place.law, friction, height=height)
+    return _path_of(place, slid, refused)
+
+
+def slide_at(
+    place: Place, displacement: Float[Array, "3"], friction: Coulomb, options: ObliqueOptions
+) -> tuple[ObliquePath, Float[Array, "2"]]:
+    """One step of `press_path` on a place that is known, by a tool that has not slid yet.
+
+    Returns:
+        The step, with a leading axis of 1, and the slip along the tube and round it, mm.
+    """
+    D, C, friction, refused = _rubbed(place, displacement[None], friction, options)
+    slid = _friction.slide(D[0], C, place.law, friction, jnp.zeros_like(D[0, 1:]))
+    return _path_of(place, jax.tree.map(lambda v: v[None], slid), refused), slid.slip
+
+
+def _rubbed(place: Place, displacement: Float[Array, "n 3"], friction: Coulomb, options):
+    """Displacements and compliance in the contact's frame, friction to compute with, refusals."""
     mu = jnp.asarray(friction.mu)
     friction = Coulomb(jnp.where(mu >= 0, mu, 0), friction.rounding)
-    refused = jnp.where(jnp.isnan(mu), PressStatus.NON_FINITE, asked.refused)
+    refused = jnp.where(jnp.isnan(mu), PressStatus.NON_FINITE, place.asked.refused)
     refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
-    frame = local_frame(phi_c)
+    frame, onset = local_frame(place.phi_c), place.onset
     D = product(displacement, frame.T)
     inward = D[:, :1]
     inward = jnp.where(inward < onset, inward - onset, touch(inward, onset, options.press))
-    D, C = jnp.concatenate([inward, D[:, 1:]], axis=1), turned(unit.compliance, frame.T)
-    height = jnp.where(onset >= 0, onset, 0)
-    slid = _friction.slide_path(D, C, law, friction, height=height)
-    unit, slid = hide(refused, unit, slid)
+    D = jnp.concatenate([inward, D[:, 1:]], axis=1)
+    return D, turned(place.unit.compliance, frame.T), friction, refused
+
+
+def _path_of(place: Place, slid: Slide, refused) -> ObliquePath:
+    """Steps in the frame of the tube."""
+    frame = local_frame(place.phi_c)
+    unit, slid = hide(refused, place.unit, slid)
     status = status_of(refused, slid.status)
     press = _assemble(unit, product(slid.force, frame), product(slid.depth, frame), status)
     sliding = slid.sliding & (refused == PressStatus.OK)

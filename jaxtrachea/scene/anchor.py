@@ -123,16 +123,28 @@ def first_contact(scene: Scene, before: Instant, here: Instant) -> Anchor:
 def has_left(scene: Scene, anchor: Anchor, before: Instant, here: Instant) -> Bool[Array, ""]:
     """Whether the tool went further along the tube in this step than its dent is wide."""
     way = press_vector(scene, anchor, here.path) - press_vector(scene, anchor, before.path)
-    return _length(way[1:]) > scene.footprint + jnp.maximum(-here.seen.gap[0], 0)
+    return length(way[1:]) > scene.footprint + jnp.maximum(-here.seen.gap[0], 0)
 
 
-def follow(scene: Scene, anchor: Anchor, here: Instant) -> Anchor:
-    """The anchor after its place has followed the tool's contact; its press is the same vector."""
+def step_length(anchor: Anchor, before: Instant, here: Instant) -> Float[Array, ""]:
+    """Way of the body point in this step, mm."""
+    return length(_at(_one(here.path), anchor.body) - _at(_one(before.path), anchor.body))
+
+
+def follow(scene: Scene, anchor: Anchor, here: Instant, most: Float[Array, ""]) -> Anchor:
+    """The anchor after its place has followed the tool's contact; its press is the same vector.
+
+    Args:
+        scene: -
+        anchor: -
+        here: the tool now.
+        most: distance at which the place follows, mm.
+    """
     now = anchor_at(scene, here)
     turn = now.phi - anchor.phi
     turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
     lag = jnp.stack([now.s - anchor.s, scene.radius * turn])
-    share = 1 - _limit(_largest_slide(scene, -here.seen.gap[0]), _length(lag))
+    share = 1 - limit(most, length(lag))
 
     def mix(old, new):
         return old + share * (new - old)
@@ -180,12 +192,12 @@ def yielded(
         place: the skeleton at the anchor.
     """
     off = way - depth * jnp.eye(3, dtype=way.dtype)[0]
-    share = _limit(_largest_slide(scene, depth), _length(off[1:]))
-    share = jnp.minimum(share, _limit(MAX_MISMATCH * depth, jnp.abs(off[0])))
+    share = limit(largest_slide(scene, depth), length(off[1:]))
+    share = jnp.minimum(share, limit(MAX_MISMATCH * depth, jnp.abs(off[0])))
     row = _stiffness(scene, depth, place)
     if row is not None:
         share = jnp.minimum(
-            share, _limit((1 - LEAST_FORCE_SHARE) * depth * row[0], -jnp.sum(row * off))
+            share, limit((1 - LEAST_FORCE_SHARE) * depth * row[0], -jnp.sum(row * off))
         )
     return way - (1 - share) * off
 
@@ -247,7 +259,7 @@ def re_anchor(scene: Scene, anchor: Anchor, way: Float[Array, "3"], path: Poses)
     return anchor._replace(unpressed=_at(_one(path), anchor.body) - press)
 
 
-def _largest_slide(scene: Scene, depth):
+def largest_slide(scene: Scene, depth):
     """Way along the surface that an anchor holds at this depth, mm."""
     return jnp.minimum(MAX_SLIDE * depth, SPACING_SHARE * half_spacing(scene))
 
@@ -270,11 +282,20 @@ def _at(pose: Poses, body):
     return _times(pose.rotation, body) + pose.translation
 
 
-def _limit(most, value):
+def limit(most, value):
     """Share of `value` that is `most`; 1 where it is less, 0 where nothing is allowed."""
     over = value > most
     return jnp.where(over, jnp.maximum(most, 0) / jnp.where(over, value, 1), 1)
 
 
-def _length(v):
+@jax.custom_jvp
+def length(v: Float[Array, " n"]) -> Float[Array, ""]:
+    """Norm, with derivative 0 at 0 (forwards without a guard: that takes a step longer)."""
     return jnp.sqrt(jnp.sum(v * v))
+
+
+@length.defjvp
+def _length_jvp(primals, tangents):
+    (v,), (dv,) = primals, tangents
+    norm = length(v)
+    return norm, jnp.sum(v * dv) / jnp.where(norm > 0, norm, 1)

@@ -30,10 +30,16 @@ def _contact_point(case: Case) -> Verdict:
             return Verdict("fixed", "one contact point")
         why = "the presses have different contact points"
         return Verdict("per_step", "several contact points", {"fixed": (why, "use 'auto'")})
+    glued, sections = case.options.contact == "bonded", SECTIONS in facts.known
+    wished = case.options.friction == "off" and "friction" not in case.finest
+    if wished and not (glued or sections):
+        reason = "friction is off as you wish: every row is a frictionless press of its own"
+        return Verdict("per_step", reason)
     if facts.slip < facts.spacing / 2:
-        way = f"the tool moves {facts.slip:.3g} mm along the surface"
-        return Verdict("fixed", f"{way}, less than half a ring spacing")
-    if case.options.contact == "bonded":
+        way = f"the tool moves {facts.slip:.3g} mm along the surface, less than half a ring spacing"
+        hand = "" if facts.friction else "; a hand that goes on wants tool.friction, or 'per_step'"
+        return Verdict("fixed", way + hand)
+    if glued:
         return Verdict("fixed", "glued where it touches first")
     reason = "the tool wanders over the rings: every row is a frictionless press of its own"
     return Verdict("per_step", reason)
@@ -182,7 +188,8 @@ class EffectOptions:
     Attributes:
         contact_point: `fixed`: the tool stays on the place it touched first; `per_step`: every row
             is a press of its own, frictionless along the surface.
-        friction: Coulomb friction along the path.
+        friction: Coulomb friction along the path; `off`: none, and of a tool led by poses the
+            contact point is `per_step`, unless that is given.
         second_plane: bending along the circumference, vectors; off: a normal press on the midline.
         rings: see `skeleton_response`.
         axial: the ligament stretches.

@@ -4,6 +4,7 @@ The program is put together from the scene's static `Plan`; what is off is not i
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,11 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
-from jaxtrachea.mechanics.oblique import Place, press_at
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
-from jaxtrachea.scene.programs import move, moved_by
+from jaxtrachea.scene.programs import Moved, move
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import hidden_rows, hide, refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
@@ -142,7 +142,7 @@ def pressed(
     material: AnyMaterial,
     path: Poses | Presses,
     made: Approach | None,
-    place: Place | None = None,
+    solve: Callable[[Presses], Moved] | None = None,
 ) -> tuple[Simulation, Pressed]:
     """All of `simulate` but the surface, and what that follows from.
 
@@ -151,16 +151,13 @@ def pressed(
         material: -
         path: as for `simulate`.
         made: the tool's way; None: the path is of presses.
-        place: where all rows press, if it is known already (a step of a session).
+        solve: what presses do, if their place is known already; None: the program of the plan.
     """
     plan = scene.plan
     safe, bad = without_negative_values(scene, material)
     given = path if isinstance(path, Presses) else None
     presses, used, inward, refused = refuse(scene, safe, given, made, bad)
-    if place is None:
-        moved = move(scene, safe, used)
-    else:
-        moved = moved_by(press_at(place, used.displacement, plan.options), plan)
+    moved = move(scene, safe, used) if solve is None else solve(used)
     force, moment, solved = moved.force, None, moved.status
     of_joints = plan.mechanics.hangs_on_rings
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:

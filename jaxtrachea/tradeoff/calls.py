@@ -13,9 +13,10 @@ from jaxtrachea._packed import Packing
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.one_row import OneRow
-from jaxtrachea.scene.session import Session, check_scene
+from jaxtrachea.scene.session import Session
 from jaxtrachea.scene.simulation import pressed, simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.scene.step import check_scene
 
 #: Turns in which calls are made one after the other, seconds of each in a turn, and of all turns
 #: together after which there is no further one. Many short turns: a machine changes its speed.

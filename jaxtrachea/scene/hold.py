@@ -1,0 +1,38 @@
+"""A step of a tool that holds the place it touched: the next state, and what is pressed there."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from jaxtrachea.scene.anchor import Instant, anchor_at, as_approach, first_contact
+from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.grip import Grip, grip, pick
+from jaxtrachea.scene.rub import rub
+from jaxtrachea.scene.stage import Poses, Scene
+from jaxtrachea.trachea.material import Material
+
+
+def hold(
+    scene: Scene, material: Material, state: Any, here: Instant, inside: Bool[Array, "1"]
+) -> tuple[Any, Poses, Approach, Grip]:
+    """The next state but for the side; pose and way of the tool on its place; its grip.
+
+    Args:
+        scene: -
+        material: -
+        state: a `step.State`.
+        here: the tool now.
+        inside: it is in the lumen.
+    """
+    hit = (here.seen.gap[0] < 0) & ~inside[0]
+    last = pick(state.started, state.last, here)
+    first = pick(hit, first_contact(scene, last, here), anchor_at(scene, here))
+    held = (rub if scene.plan.friction else grip)(scene, material, state, last, here, first, hit)
+    rest, made = as_approach(scene, held.anchor, held.way, here, inside)
+    after = dataclasses.replace(
+        state, started=jnp.asarray(True), touching=held.touching, last=here, anchor=held.after,
+        slip=held.slip,
+    )  # fmt: skip
+    return after, rest, made, held

@@ -1,0 +1,307 @@
+"""A scene as a function: `init_state`, and `step` by step forces and surface for a pose.
+
+Pure: under `jit`, `vmap` (an environment each), `grad` through a whole contact history, and as the
+body of `lax.scan`. `Session` is the compiled loop over it.
+"""
+
+import dataclasses
+import hashlib
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrachea._arguments import ArrayLike, check_word, shaped
+from jaxtrachea._numerics import full_precision
+from jaxtrachea._packed import Packing
+from jaxtrachea.contact.pose import check_rotations
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
+from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.grip import Slip, pick
+from jaxtrachea.scene.hold import hold
+from jaxtrachea.scene.lumen import Side, next_side, whereabouts
+from jaxtrachea.scene.one_row import Row
+from jaxtrachea.scene.plan import Plan
+from jaxtrachea.scene.rub import no_slip
+from jaxtrachea.scene.simulation import Pressed, Simulation, pressed
+from jaxtrachea.scene.stage import Poses, Scene, check_kind, check_material, touch_tube
+from jaxtrachea.status import PressStatus
+
+#: Rises when the fields of a `State` or their meaning change.
+STATE_VERSION = 1
+
+
+class Origin(NamedTuple):
+    """What a state belongs to.
+
+    Attributes:
+        version: of the fields of a `State`.
+        plan: of its scene.
+        numbers: digest of the arrays of its scene; empty where they were traced.
+    """
+
+    version: int
+    plan: Plan
+    numbers: str
+
+
+class State(eqx.Module):
+    """What the next step must know; a pytree of arrays, which can be saved, copied and batched.
+
+    Attributes:
+        started: there was a step.
+        touching: the tool is on its anchor.
+        side: a `lumen.Side`.
+        last: the step before.
+        anchor: the place that the tool holds.
+        slip: way it has slid on it; None: no friction.
+        origin: the scene that the state belongs to (static).
+    """
+
+    started: Bool[Array, ""]
+    touching: Bool[Array, ""]
+    side: Int[Array, ""]
+    last: Instant
+    anchor: Anchor
+    slip: Slip | None
+    origin: Origin = eqx.field(static=True)
+
+
+def init_state(scene: Scene, material: AnyMaterial) -> State:
+    """The state before the first step: the tool was nowhere.
+
+    Args:
+        scene: from `make_scene` with a path of `Poses`.
+        material: as the plan needs it.
+
+    Raises:
+        ValueError: as `Session`.
+    """
+    check_scene(scene, material)
+    state = _start(scene)
+    return dataclasses.replace(state, origin=origin_of(scene))
+
+
+def step(
+    scene: Scene,
+    material: AnyMaterial,
+    state: State,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+) -> tuple[State, Simulation]:
+    """Move the tool: the next state, and what happens at this pose.
+
+    It does what `Session.step` does. A pose that is not finite is a row of NaN with NON_FINITE and
+    leaves the state as it was. Scenes of many environments may differ in their arrays (`vmap` over
+    scene, material and state; make the states by `vmap` of `init_state`), not in their plans.
+
+    Args:
+        scene: that the state was made for.
+        material: may change from step to step.
+        state: from `init_state`, or of the step before.
+        rotation: of the tool, orthogonal with determinant 1 (checked where it is not traced);
+            shape (3, 3).
+        translation: of its origin, mm; shape (3,).
+
+    Returns:
+        The next `State`, and a `Simulation` without the axis of rows.
+
+    Raises:
+        ValueError: the state of another scene or version; a pose of another shape or dtype, or no
+            rotation; a material that does not fit. What is traced is checked by shape and dtype.
+    """
+    check_scene(scene, material)
+    check_state(scene, state)
+    dtype = scene.footprint.dtype
+    rotation = shaped("rotation", rotation, (3, 3), why=" (one pose)")
+    translation = shaped("translation", translation, (3,), why=" (one pose)")
+    for name, v in (("rotation", rotation), ("translation", translation)):
+        if v.dtype != dtype:
+            raise ValueError(f"{name} is {v.dtype}; expected {dtype}, as the scene has")
+    if not isinstance(rotation, Tracer):
+        check_rotations("rotation", np.asarray(rotation)[None])
+    given = scene, material, state, rotation, translation
+    traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(given))
+    return _step(*given) if traced else _compiled(*given)
+
+
+def check_scene(scene: Scene, material: AnyMaterial) -> None:
+    """Refuse a scene or a material that cannot go step by step.
+
+    Raises:
+        ValueError: see `Session`.
+    """
+    check_word("scene", scene, Scene)
+    if not scene.plan.contact or scene.tool is None:
+        raise ValueError("the plan has no contact; make the scene with a path of Poses")
+    if not scene.plan.mechanics.stepwise:
+        raise ValueError(
+            "a session has no skeleton 'sections'; use simulate, or make the scene with the "
+            "Material of a line of joints"
+        )
+    check_kind(scene, material)
+    check_material(scene.geometry, material)
+
+
+def check_state(scene: Scene, state: State) -> None:
+    """Refuse what is no state of this scene.
+
+    Raises:
+        ValueError: another version, plan, dtype, or other arrays; or no state.
+    """
+    check_word("state", state, State)
+    version, plan, numbers = state.origin
+    if version != STATE_VERSION:
+        raise ValueError(f"state has version {version}; expected {STATE_VERSION}: begin anew")
+    if plan != scene.plan:
+        raise ValueError(f"state belongs to a scene of another plan: {_unlike(plan, scene.plan)}")
+    dtype = scene.footprint.dtype
+    found = state.anchor.point.dtype
+    if found != dtype:
+        raise ValueError(f"state is {found}; expected {dtype}, as the scene has")
+    if numbers and digest_of(scene) not in ("", numbers):
+        raise ValueError(
+            "state belongs to another scene: of the same plan, but with another tube, tool or mesh;"
+            " make a state by init_state"
+        )
+
+
+def _unlike(found: Plan, expected: Plan) -> str:
+    """The first field in which two plans differ."""
+    for field in dataclasses.fields(Plan):
+        a, b = getattr(found, field.name), getattr(expected, field.name)
+        if field.compare and a != b:
+            return f"{field.name} is {a!r}; expected {b!r}"
+    raise AssertionError("plans are equal")
+
+
+def origin_of(scene: Scene) -> Origin:
+    """What a state of this scene belongs to."""
+    return Origin(STATE_VERSION, scene.plan, digest_of(scene))
+
+
+def digest_of(scene: Scene) -> str:
+    """Of all arrays of a scene; empty if one of them is traced."""
+    leaves = jax.tree.leaves(scene)
+    if any(isinstance(v, Tracer) for v in leaves):
+        return ""
+    made = hashlib.blake2b(digest_size=16)
+    for v in map(np.asarray, leaves):
+        made.update(f"{v.dtype}{v.shape}".encode())
+        made.update(np.ascontiguousarray(v).tobytes())
+    return made.hexdigest()
+
+
+@jax.jit
+def _start(scene: Scene) -> State:
+    """Before the first step."""
+    dtype = scene.footprint.dtype
+    path = Poses(jnp.eye(3, dtype=dtype)[None], jnp.zeros((1, 3), dtype))
+    shapes = jax.eval_shape(touch_tube, scene, path)
+    seen = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+    no, nowhere = jnp.asarray(False), Instant(path, seen)
+    return State(
+        started=no, touching=no, side=jnp.asarray(Side.UNTOLD), last=nowhere,
+        anchor=anchor_at(scene, nowhere), slip=no_slip(dtype) if scene.plan.friction else None,
+        origin=origin_of(scene),
+    )  # fmt: skip
+
+
+class Changeable(NamedTuple):
+    """What may change from step to step: an argument of the program, not a constant in it.
+
+    Attributes:
+        material: -
+        tool: its shape about its own origin.
+        footprint: of the scene, which goes with the tool.
+    """
+
+    material: AnyMaterial
+    tool: Shape
+    footprint: Float[Array, ""]
+
+
+def changeable(scene: Scene, material: AnyMaterial) -> Changeable:
+    """What may change, of this scene."""
+    assert scene.tool is not None
+    return Changeable(material, scene.tool, scene.footprint)
+
+
+class Numbers:
+    """A step of numbers: what changes, and the state, are one array each (`_packed`).
+
+    Attributes:
+        given: layout of what may change.
+        states: layout of the state.
+    """
+
+    def __init__(self, scene: Scene, given: Changeable, state: State):
+        """Lay out what changes and the state, or others of their shapes."""
+        self._scene = scene
+        self.given, self.states = Packing(given, weak=scene.footprint.dtype), Packing(state)
+
+    def setting(self, rotation, translation, numbers) -> tuple[Scene, AnyMaterial]:
+        """Scene and material (traced)."""
+        new = self.given.unpack(numbers)
+        scene = dataclasses.replace(self._scene, tool=new.tool, footprint=new.footprint)
+        return scene, new.material
+
+    def step(self, state, rotation, translation, numbers):
+        """As `move_tool` (traced)."""
+        scene, material = self.setting(rotation, translation, numbers)
+        moved = move_tool(scene, material, self.states.unpack(state), rotation, translation)
+        return self.states.pack(moved[0]), *moved[1:]
+
+
+def _step(scene: Scene, material: AnyMaterial, state: State, rotation, translation):
+    """`step`, of arguments that are checked: by the program of a `Session`.
+
+    To the bit, if the scene is no argument of the compiled function: its arrays are constants there
+    as here, and those that may change are none (hence the barrier).
+    """
+    given = changeable(scene, material)
+    numbers = Numbers(scene, given, state)
+    row = Row(scene, numbers.setting, numbers.step)
+    packed, result = row(
+        numbers.states.pack(state),
+        rotation,
+        translation,
+        jax.lax.optimization_barrier(numbers.given.pack(given)),
+    )
+    return numbers.states.unpack(packed), result
+
+
+_compiled = jax.jit(_step)
+
+
+@full_precision
+def move_tool(
+    scene: Scene, material: Any, state: State, rotation, translation
+) -> tuple[State, Simulation, tuple[Poses, Pressed]]:
+    """The next state, the result without its axis of rows, and what the surface follows from."""
+    path = Poses(rotation[None], translation[None])
+    each = approach(scene, path) if scene.plan.contact_point == "per_step" else None
+    here = Instant(path, touch_tube(scene, path) if each is None else each.seen)
+    at = jax.tree.map(lambda v: v[0], whereabouts(scene, *here))
+    side = next_side(state.side, at)
+    inside = (side == Side.IN_LUMEN)[None]
+    if each is None:
+        after, path, each, held = hold(scene, material, state, here, inside)
+        result, press = pressed(scene, material, path, each, held.solve)
+        if held.total is not None and result.slip is not None:
+            total = jnp.where(jnp.isnan(result.slip), jnp.nan, held.total)
+            result = result._replace(slip=total)
+    else:
+        after, each = state, each._replace(inside=inside)
+        result, press = pressed(scene, material, path, each)
+    after = dataclasses.replace(after, side=side)
+    result = jax.tree.map(lambda v: v[0], result)
+    wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
+    result = result._replace(status=jnp.where(at.known, result.status, wrong))
+    return pick(at.known, after, state), result, (path, press)
