@@ -234,7 +234,7 @@ def test_what_is_timed_of_a_press_is_what_simulate_gives(record, dtype):
 @pytest.mark.compiling
 @pytest.mark.parametrize("friction", [False, True])
 def test_what_is_timed_of_a_tool_is_its_step(friction):
-    """A step of a `Session`: the numbers of `simulate` of the last pose."""
+    """A step of a `Session`; with friction `simulate` of the last pose."""
     record = BUILT_IN | {"output": {"surface": friction}}
     if friction:
         record = record | {"tool": record["tool"] | {"friction": 0.3}}

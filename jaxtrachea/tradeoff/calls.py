@@ -62,6 +62,8 @@ def one_pose(arguments: Arguments) -> Call:
     """
     scene, material, path = arguments
     row = last_row(path)
+    if scene.plan.friction:  # a step of it depends on the steps before
+        return _alone(scene, material, row)
     try:
         check_scene(scene, material)
     except ValueError:
