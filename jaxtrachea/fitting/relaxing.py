@@ -157,9 +157,10 @@ def relaxed_press(
     branches, along = jax.vmap(push, out_axes=(None, 0))(tangents)
     columns = pressed.d_load[np.array(elastic, int)]
     softens, load = pressed.load is not pressed.force, pressed.load
-    ratio = _ratio(pressed.force, load) if softens else 1.0
+    ratio = _ratio(pressed.force, load)
     if pressed.corner is not None:  # linear in the load like its derivatives
-        columns = jnp.concatenate([columns, (pressed.corner / ratio)[None]])
+        corner = pressed.corner / ratio if softens else pressed.corner
+        columns = jnp.concatenate([columns, corner[None]])
     relaxed, slopes = relax_with_derivatives(
         time, pressed.load, columns, branches, _lets_go(model), along,
         surface=pressed.d_joints is not None,
@@ -173,8 +174,10 @@ def relaxed_press(
     force, d_force = relaxed.force, in_order(slopes.force)
     corner = None if pressed.corner is None else slopes.force[len(elastic)]
     if softens:
-        d_ratio = (pressed.d_force - ratio * pressed.d_load) / jnp.where(load == 0, 1, load)
-        d_force = ratio * d_force + jnp.where(load == 0, 0, d_ratio) * force
+        at = jnp.where(load == 0, 1, load)[None]
+        d_ratio = (pressed.d_force - ratio[None] * pressed.d_load) / at
+        d_ratio = jnp.where((load == 0)[None], 0, d_ratio)
+        d_force = ratio[None] * d_force + d_ratio * force[None]
         force, corner = ratio * force, None if corner is None else ratio * corner
     return pressed._replace(
         force=force, d_force=d_force, load=relaxed.elastic, d_load=in_order(slopes.elastic),
