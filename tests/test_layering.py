@@ -320,7 +320,16 @@ LOADS = {
     "fit": (["fit", FIT], READS | {"scipy", "scipy.special", "matplotlib", "PIL"}),
     "simulate": (
         ["simulate", SCENE],
-        READS | {"scipy", "scipy.spatial", "scipy.special", "matplotlib", "PIL", "trimesh"},
+        READS
+        | {
+            "scipy",
+            "scipy.spatial",
+            "scipy.special",
+            "matplotlib",
+            "PIL",
+            "trimesh",
+            "scipy.optimize",
+        },
     ),
 }
 
