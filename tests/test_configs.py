@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 from run_cli import run, tree
@@ -108,7 +109,7 @@ def test_scene_runs(scene, monkeypatch, capsys):
     assert ("contact patches: " in out) == ("tool" in text)
     result = scene.parent / "result"
     output = text.get("output", {})
-    files = {"simulation.h5", "provenance.json"}
+    files = {"simulation.h5", "forces.csv", "provenance.json"}
     if output.get("surface", True):
         files |= {"deformed.ply", "deformed.glb"}
     if output.get("pictures", True):
@@ -120,6 +121,9 @@ def test_scene_runs(scene, monkeypatch, capsys):
         force, status = file["series/force"][:], file["series/status"][:]
         assert file["series/force"].attrs["unit"] == "N"
     assert np.isfinite(force).all()
+    table = pd.read_csv(result / "forces.csv")
+    np.testing.assert_array_equal(table[[f"force_{axis}_N" for axis in "xyz"]], force)
+    assert [PressStatus[word] for word in table["status"]] == status.tolist()
     assert set(status) <= {0, 1}
     assert np.abs(force[-1]).max() > 0
     if "deformed.ply" in files:

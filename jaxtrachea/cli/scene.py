@@ -69,7 +69,12 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import jax
 
     from jaxtrachea.files.traces import Traced
-    from jaxtrachea.scene.results import last_solved, write_meshes, write_simulation
+    from jaxtrachea.scene.results import (
+        last_solved,
+        write_forces,
+        write_meshes,
+        write_simulation,
+    )
     from jaxtrachea.scene.simulation import simulate as run
 
     clock = [time.perf_counter()]
@@ -87,6 +92,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
         title = spec.title or scene.stem
         with beside(_draw, folder, title, spec.output.pictures, staged.scene, out) as drawing:
             write_meshes(folder, staged.scene, out)
+            write_forces(folder / "forces.csv", out)
             made = _provenance(scene, staged, clock)
             write_simulation(folder / "simulation.h5", staged.scene, staged.path, out, made)
             _write_json(folder, made)

@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
+from jaxtrachea.files.table import Table
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -52,6 +53,26 @@ def write_simulation(
             rest = file.create_group("rest")
             rest.create_dataset("vertices", data=scene.mesh.vertices).attrs["unit"] = "mm"
             rest.create_dataset("faces", data=scene.mesh.faces).attrs["unit"] = "1"
+
+
+def write_forces(path: Path, out: Simulation) -> None:
+    """A row of numbers for each row of a simulation, as CSV (docs/simulate.md)."""
+    names = {"s": ("s_mm",), "phi": ("phi_rad",), "gap": ("gap_mm",)}
+    names |= {
+        name: tuple(f"{name}_{axis}_{unit}" for axis in "xyz")
+        for name, unit in (("displacement", "mm"), ("force", "N"), ("skeleton", "mm"))
+    }
+    columns: dict[str, np.ndarray] = {}
+    for name, heads in names.items():
+        if (value := getattr(out, name)) is not None:
+            parts = np.asarray(value, float).reshape(len(out.status), -1).T
+            columns |= dict(zip(heads, parts, strict=True))
+    columns["depth_share"] = np.asarray(out.depth_share, float)
+    rows = [
+        {"row": i + 1, **{head: float(v[i]) for head, v in columns.items()}, "status": word}
+        for i, word in enumerate(PressStatus(int(v)).name for v in np.asarray(out.status))
+    ]
+    Table(rows).write_csv(path)
 
 
 def write_sweep(path: Path, scene: Scene, s, phi, depth: float, out: Sweep, made: dict) -> None:
