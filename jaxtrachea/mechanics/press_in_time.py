@@ -20,8 +20,9 @@ from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.levels.options import Options, check_line
 from jaxtrachea.mechanics.press import Press
-from jaxtrachea.mechanics.relaxation_parts import relax_parts
+from jaxtrachea.mechanics.relaxation_parts import relax_parts, way_of
 from jaxtrachea.mechanics.samples import as_before, in_order, no_history
+from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.relaxation.filter import Relaxation, relax
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -41,7 +42,8 @@ def press_in_time(
     elastic one and the force a filter of the elastic force (`relaxation.filter`); with `parts`
     local law and skeleton relax apart (`mechanics.relaxation_parts`). The values of the material
     are those of the long run. Softening is geometry, which remembers nothing: the force of small
-    strain relaxes, times the softening of the present displacement.
+    strain relaxes, times the softening of the present displacement; where parts relax apart, of the
+    way at which the skeleton of an elastic press would be as deflected as it is.
 
     Args:
         geometry: the tube at rest.
@@ -121,8 +123,9 @@ def _press_in_time(
     solved = _in_time(time, moved, skipped, unit.w_C, law, relaxation, elastic, options)
     status = jnp.where(skipped, order, solved.status)
     if softening is not None:
-        ratio = softening.ratio(jnp.where(jnp.isfinite(solved.force), moved, 0))
-        solved = solved._replace(force=ratio * solved.force)
+        apart = relaxation.skeleton is not None
+        way = way_of(solved.load, unit.w_C, law) if apart else moved
+        solved, status = _softened(solved, status, softening, way)
     unit, solved = hide(refused, unit, solved)
     load = solved.load
 
@@ -138,6 +141,17 @@ def _press_in_time(
         compliance=unit.w_C,
         status=status_of(refused, status),
     )
+
+
+def _softened(solved: Equilibrium, status, softening: Softening, way):
+    """The press with the softening of a way; past the fold of that the sample is PAST_FOLD."""
+    there = jnp.isfinite(solved.force)
+    folded = there & (~jnp.isfinite(way) | softening.past_peak(way))
+    ratio = softening.ratio(jnp.where(there & ~folded, way, 0))
+    force = jnp.where(folded, jnp.nan, ratio * solved.force)
+    depth, load = (jnp.where(folded, jnp.nan, v) for v in (solved.depth, solved.load))
+    status = jnp.where(folded, PressStatus.PAST_FOLD, status)
+    return solved._replace(force=force, depth=depth, load=load), status
 
 
 def _validated(relaxation: Relaxation, refused):

@@ -64,6 +64,15 @@ def relax_parts(
     return Parts(*loop(*parts, displacement, compliance, law))
 
 
+def way_of(load: Float[Array, " N"], compliance: Float[Array, ""], law: Law) -> Float[Array, " N"]:
+    """Way of an elastic press whose skeleton is as deflected, mm; NaN past the fold of the law.
+
+    Of parts that relax alike it is the way of the tool. Where they relax apart the skeleton is
+    deflected more or less than that says, and with it the shape that softens.
+    """
+    return compliance * load + law.root(load, jnp.ones_like(load), 0.0)
+
+
 def _loop(local, skeleton, displacement, compliance, law: Law, unilateral: bool = True):
     """Force, depth, load and fold; arrays may have lanes as their last axis.
 
