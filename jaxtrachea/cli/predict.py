@@ -25,7 +25,8 @@ AtOption = Annotated[
     typer.Option(
         "--at",
         metavar="s=75,D=0:6:0.5",
-        help="Contact position and displacement, mm (and phi, tilt, deg); repeatable.",
+        help="Contact position and displacement, mm (and phi, tilt, deg; where the force relaxes "
+        "speed=5 mm/s, hold=30 s); repeatable.",
     ),
 ]
 DataOption = Annotated[
@@ -96,9 +97,9 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     from jaxtrachea.prediction.plots import draw_predictions
     from jaxtrachea.prediction.predict import predict_sources
 
-    sources, s, depths, aside = _asked(stored, texts)
+    sources, s, depths, aside, times = _asked(stored, texts)
     with into(out_dir, default) as (folder, stop_if_asked):
-        curves = predict_sources(stored, sources, s, depths, aside=aside)
+        curves = predict_sources(stored, sources, s, depths, aside=aside, times=times)
         stop_if_asked()
         rings = np.asarray(stored.study.model.geometry.ring_positions)
         rows = {
@@ -120,19 +121,20 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
 
 
 def _asked(stored, texts: Sequence[str]):
-    """Sources, positions, displacements, and angle with direction, of every --at."""
+    """Sources, positions, displacements, angle with direction, and times, of every --at."""
     from jaxtrachea.measurements.presses import parse_presses
-    from jaxtrachea.prediction.predict import check_aside, check_position
+    from jaxtrachea.prediction.predict import check_aside, check_position, check_timed
     from jaxtrachea.prediction.pressed import pressed
     from jaxtrachea.prediction.sources import source_of
 
     fitted = pressed(stored)
     needs = stored.study.model.options.coupling == "series"
-    sources, places, depths, aside = [], [], [], []
+    sources, places, depths, aside, times = [], [], [], [], []
     for text in texts:
         try:
             asked = parse_presses(text, needs_position=needs)
             check_aside(stored, asked.phi, asked.direction)
+            check_timed(stored, asked.time is not None, "speed (as speed=5 mm/s), and hold")
             names = fitted.specimens if asked.specimen is None else (asked.specimen,)
             if asked.specimen is not None and asked.specimen not in fitted.specimens:
                 raise ValueError(_unknown("specimen", asked.specimen, fitted.specimens))
@@ -152,7 +154,8 @@ def _asked(stored, texts: Sequence[str]):
                 places.append(place)
                 depths.append(asked.displacement)
                 aside.append((asked.phi, asked.direction))
-    return sources, places, depths, aside
+                times.append(asked.time)
+    return sources, places, depths, aside, times if stored.study.model.relaxes else None
 
 
 def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, digest) -> int:

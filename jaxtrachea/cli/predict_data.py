@@ -108,9 +108,9 @@ def _same_model(stored, path: Path, spec) -> None:
                     f"{path}: trachea: {words(its)}, but the fit's is {words(mine)}; predictions "
                     "are made with the fit's: leave the section out, or correct it"
                 )
-    if "model" in spec.model_fields_set and Options(**spec.model.model_dump()) != (
-        stored.study.model.options
-    ):
+    mine = stored.study.model.options
+    its = Options(**spec.model.model_dump(), shortest=mine.shortest, longest=mine.longest)
+    if "model" in spec.model_fields_set and its != mine:
         raise Stop(
             f"{path}: model: not that of the fit, with which predictions are made; leave the "
             "section out, or fit again with it"

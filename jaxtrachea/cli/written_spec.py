@@ -18,6 +18,7 @@ _MODEL = {
     "half_width": "of a flat tool along the tube: pi/4 of its radius; 0: a point",
     "skeleton": '"softening": presses deeper than a tenth of the radius; "sections": off the '
     "midline",
+    "relaxation": '"uniform" (or "parts"): the force relaxes; needs loading = "record"',
     "contact": '"bonded": press or draw',
     "coupling": '"total": a sample without a tube under it, which needs no s',
 }
@@ -128,6 +129,9 @@ def _data(sources: Sources, out: Path, blocked: str | None) -> Iterator[str]:
         yield from _marked(blocked)
         yield '# s = "40 mm"'
     yield '# loading = "last"          # the last full loading; or "first", "all"'
+    if any(c.time is not None for c in curves):
+        yield '# e.g. loading = "record": all of it by its time, for a force that relaxes ([model])'
+        yield "# e.g. samples = 400: about so many samples of such a record, by means of blocks"
     yield '# e.g. displacement_max = "6 mm": samples beyond are left out'
     if any(c.joint_displacement is not None for c in curves):
         yield '# e.g. tool_radius = "3 mm": markers nearer to the contact move with the tool'

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from jaxtrachea.files.table import Table
+from jaxtrachea.fitting.branch_times import unsampled_time
 from jaxtrachea.fitting.covariance import NORMAL, Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.effective import Effective, effective
@@ -318,7 +319,8 @@ class Assessment(NamedTuple):
         high: likewise.
         ends: `ProfileEnd` of the two; None where the interval is local.
         error: relative error that the verdict rests on: the longer side of the interval over that
-            of one standard error, or the local one, with its growth.
+            of one standard error, or the local one, with its growth; inf of a branch whose time the
+            records do not show (`branch_times`).
         standard_error: in the parameter's unit, with its growth; NaN where the data do not
             determine the unknown: on a bound, open on a side, or where the model misses the curve.
         relative_se: likewise, relative as `FitResult.relative_se`.
@@ -363,6 +365,8 @@ def _assess(result: FitResult, lane: int, i: int, profiles: Intervals | None) ->
         error = _longer_side(result, lane, i, plain_low, plain_high)
         error /= float(result.uncertainty.half_width[lane])
     error *= growth
+    if unsampled_time(result, lane, i):
+        error = np.inf
     word = verdict(
         error, structural=structural, held=held, ends=ends, misses=misses,
         unseen=ends is None and bool(result.unexamined[lane, i]),

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from jaxtrachea.fitting.branch_times import unsampled_time
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.press_scale import sizes_of_press
 from jaxtrachea.fitting.result import (
@@ -132,6 +133,12 @@ def _limited(result: FitResult, lane: int, profiles: Profiles | None) -> list[st
     return said
 
 
+def _unsampled(result: FitResult, lane: int) -> list[str]:
+    """Which branches of the relaxation the records do not show, each once."""
+    told = (unsampled_time(result, lane, i) for i in range(_count(result, lane)))
+    return list(dict.fromkeys(filter(None, told)))
+
+
 def _listed(verdict: str, names: list[str]) -> str:
     """``weak: EI_L, k_M``; the reason of a verdict stands in brackets."""
     word, _, reason = verdict.partition(": ")
@@ -150,6 +157,7 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
     said = [_listed(word, groups[word]) for word in VERDICTS if word in groups]
     said += _limited(result, lane, profiles)
+    said += _unsampled(result, lane)
     if not result.effective.misses[lane]:
         said.append(weakest_sentence(result, lane))
     if result.study.joint and result.unexamined[lane].any():

@@ -107,7 +107,7 @@ def remarks_of(
         p: v
         for p in found.parts
         if p.kind in ("load", "unload")
-        and (v := _speed(time[p.start : p.stop], displacement[p.start : p.stop])) > 0
+        and (v := speed_of(time[p.start : p.stop], displacement[p.start : p.stop])) > 0
     }
     if not speeds:
         return
@@ -128,7 +128,7 @@ def remarks_of(
         yield f"k_1 is that of {at}: in the hold the force falls by {100 * most:.2g} %"
 
 
-def _speed(time: np.ndarray, displacement: np.ndarray) -> float:
+def speed_of(time: np.ndarray, displacement: np.ndarray) -> float:
     """Of a ramp, mm/s, from a tenth to nine tenths of its way; 0 where it is too short."""
     way = np.abs(displacement - displacement[0])
     within = np.flatnonzero((way > 0.1 * way.max()) & (way < 0.9 * way.max()))

@@ -39,18 +39,6 @@ class Response(NamedTuple):
     joint_side: Float[Array, "*n rings"] | None = None
 
 
-class OffMidline(NamedTuple):
-    """Where a press is beside the position along the tube; of a level that presses there.
-
-    Attributes:
-        phi_c: angle from the anterior midline, rad.
-        direction: of the tool, along the inward normal and the circumference; (2,).
-    """
-
-    phi_c: Float[Array, ""]
-    direction: Float[Array, "2"]
-
-
 class Predicted(NamedTuple):
     """A response with standard errors from the parameters alone; inf where undetermined.
 
@@ -89,13 +77,7 @@ class Estimate(NamedTuple):
 
 
 def respond(
-    model: FitModel,
-    free: Float[Array, " F"],
-    value: Float[Array, " J"],
-    s_c: Float[Array, ""],
-    displacement: Float[Array, " N"],
-    blend: Float[Array, ""] | None = None,
-    aside: OffMidline | None = None,
+    model: FitModel, free: Float[Array, " F"], value: Float[Array, " J"], motion: Motion
 ) -> tuple[Response, Int[Array, " N"]]:
     """The fitted model at one position: response and `PressStatus`; pure.
 
@@ -103,31 +85,26 @@ def respond(
         model: of the fit (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
-        s_c: mm.
-        displacement: mm.
-        blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; None: that of the
-            options.
-        aside: off the midline, or not along the normal; None: neither.
+        motion: of the tool; its onset is that of the parameters. Where the force relaxes it has
+            its time.
     """
     tube = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
-    phi_c, direction = aside or (None, None)
-    motion = Motion(s_c, displacement, blend=blend, phi_c=phi_c, direction=direction)
     found = answer(model, free, value, motion, tube)
     return Response(*(getattr(found, name) for name in Response._fields)), found.status
 
 
-def jacobian(model: FitModel, free, value, s_c, displacement, blend=None, aside=None):
+def jacobian(model: FitModel, free, value, motion: Motion):
     """`respond`, its statuses, and its derivative by every free column, a leading axis (F, ...)."""
 
     def push(tangent):
         def at(free):
-            return respond(model, free, value, s_c, displacement, blend, aside)
+            return respond(model, free, value, motion)
 
         out, moved, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
         return out, status, moved
 
     if not len(free):
-        out, status = respond(model, free, value, s_c, displacement, blend, aside)
+        out, status = respond(model, free, value, motion)
         return out, status, jax.tree.map(lambda v: jnp.zeros((0, *v.shape), v.dtype), out)
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
     return jax.vmap(push, out_axes=(None, None, 0))(eye)
@@ -170,31 +147,25 @@ def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Arr
 def predicted(
     model: FitModel,
     estimate: Estimate,
-    s_c: Float[Array, ""],
-    displacement: Float[Array, " N"],
-    blend: Float[Array, ""] | None = None,
+    motion: Motion,
     slack: Float[Array, "N F"] | None = None,
-    aside: OffMidline | None = None,
 ) -> Predicted:
     """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
 
     Args:
         model: of the fit (static).
         estimate: with its uncertainty.
-        s_c: mm.
-        displacement: mm; at least one.
-        blend: see `respond`.
+        motion: see `respond`; of one displacement at least.
         slack: where the fit has pressed, how far it sees slopes: its least ratio of singular values
             times the root of its samples, times the size of each unknown; elsewhere 0; None: 0.
-        aside: see `respond`.
     """
     free, value, covariance, null_space, half_width = estimate
-    out, status, slopes = jacobian(model, free, value, s_c, displacement, blend, aside)
+    out, status, slopes = jacobian(model, free, value, motion)
     se = jax.tree.map(lambda slope: standard_errors(slope, covariance, null_space), slopes)
     if slack is not None:
         unseen = _unseen(slopes.force, slack)
         se = se._replace(force=standard_errors(slopes.force, covariance, null_space, unseen))
-    deepest = jnp.argmax(jnp.abs(displacement))
+    deepest = jnp.argmax(jnp.abs(motion.displacement))
     pull = covariance @ slopes.force[:, deepest]
     along = jnp.sqrt(jnp.maximum(slopes.force[:, deepest] @ pull, 0))
     known = (along > 0) & jnp.isfinite(half_width)
@@ -202,7 +173,7 @@ def predicted(
     straight = jnp.einsum("f...,f->...", slopes.force, step)
 
     def bend(sign):
-        end, _ = respond(model, free + sign * step, value, s_c, displacement, blend, aside)
+        end, _ = respond(model, free + sign * step, value, motion)
         return end.force - out.force - sign * straight
 
     if model.level.iterates:  # one program for both: it is long to compile
@@ -212,7 +183,7 @@ def predicted(
     return Predicted(out, se, status, bends, deepest)
 
 
-def force_and_slope(model: FitModel, free, value, s_c, displacement, blend=None, aside=None):
+def force_and_slope(model: FitModel, free, value, motion: Motion):
     """Force of one curve and its derivative by the free columns; (N,) and (F, N)."""
-    out, _, slopes = jacobian(model, free, value, s_c, displacement, blend, aside)
+    out, _, slopes = jacobian(model, free, value, motion)
     return out.force, slopes.force

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,8 +21,9 @@ from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.zeros import resolved
 from jaxtrachea.measurements.observed import WITHOUT_VECTORS
 from jaxtrachea.measurements.read import BadCurve, Curve
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.prediction.core import OffMidline, force_and_slope
+from jaxtrachea.prediction.core import force_and_slope
 from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
 from jaxtrachea.prediction.pressed import pressed
@@ -146,9 +148,15 @@ def compare(
     if stored.study.model.level.off_midline:
         aside = [(c.phi_c, (c.direction[0], c.direction[1])) for c in curves]
     depths = [c.displacement for c in curves]
-    found = predict_sources(stored, sources, s, depths, sigmas, aside=aside)
+    times = [_time_of(c) for c in curves] if stored.study.model.relaxes else None
+    found = predict_sources(stored, sources, s, depths, sigmas, aside=aside, times=times)
     offsets = [value_of(stored, source, "force_offset") for source in sources]
     return [Compared(*row) for row in zip(curves, found, words, offsets, strict=True)]
+
+
+def _time_of(curve: Curve) -> np.ndarray:
+    assert curve.time is not None  # else it is not `pressable`
+    return np.asarray(curve.time)
 
 
 def _with_zeros(stored: FitResult, curves: Sequence[Curve]) -> tuple[FitResult, Taken]:
@@ -185,6 +193,8 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
     same = np.array_equal(used.force, curve.force)
     same = same and np.array_equal(used.displacement, curve.displacement)
     same = same and (used.s_c == curve.s_c)
+    if used.time is not None and curve.time is not None:
+        same = same and np.array_equal(used.time, curve.time)
     same = same and used.phi_c == curve.phi_c and tuple(used.direction) == tuple(curve.direction)
     return "yes" if same else "changed"
 
@@ -313,14 +323,13 @@ def _slopes(stored: FitResult, own, sources, theta, own_study: Study) -> list[np
     lanes = own_study.lanes
     run = program(force_and_slope, stored.study.model)
     value = np.stack([source.value for source in sources])
-    columns = [free, value, lanes.s_c[:, 0], lanes.displacement[:, 0]]
-    columns += [] if lanes.blend is None else [lanes.blend[:, 0]]
-    more = {}
-    if lanes.phi_c is not None and lanes.direction is not None:
-        more = {
-            "aside": OffMidline(jnp.asarray(lanes.phi_c[:, 0]), jnp.asarray(lanes.direction[:, 0]))
-        }
-    _, slopes = run(*map(jnp.asarray, columns), **more)
+
+    def first(name):
+        found = getattr(lanes, name)
+        return None if found is None else found[:, 0]
+
+    motion = Motion(onset=None, **{n: first(n) for n in Motion._fields if n != "onset"})
+    _, slopes = run(*jax.tree.map(jnp.asarray, (free, value, motion)))
     return [np.asarray(slopes[k])[:, lanes.precision[k, 0] > 0] for k in range(len(sources))]
 
 

@@ -59,7 +59,7 @@ def _panels(curves: Sequence[tuple[CurvePrediction, np.ndarray | None]]) -> Figu
         _one_panel(axis, members[:LINES])
         left = len(members) - LINES
         more = f" (the first {LINES} of {len(members)} curves)" if left > 0 else ""
-        axis.set(title=plain(name) + more, xlabel="displacement [mm]", ylabel="force [N]")
+        axis.set(title=plain(name) + more, xlabel=_along(members[0][0])[1], ylabel="force [N]")
     for axis in list(figure.axes)[len(shown) :]:
         axis.set_visible(False)
     most = max(map(len, groups.values()), default=0)
@@ -70,12 +70,20 @@ def _panels(curves: Sequence[tuple[CurvePrediction, np.ndarray | None]]) -> Figu
     return figure
 
 
+def _along(p: CurvePrediction) -> tuple[np.ndarray, str]:
+    """What a curve is drawn along, from its first sample: time where the force relaxes."""
+    if p.time is None:
+        return p.displacement, "displacement [mm]"
+    return p.time - p.time[0], "time [s]"
+
+
 def _one_panel(axis, members) -> None:
     """Curves of one specimen: dots measured, line predicted, shades both bands."""
     colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(members)))
     for (p, measured), colour in zip(members, colours, strict=True):
-        order = np.argsort(p.displacement, kind="stable")
-        D = p.displacement[order]
+        along = _along(p)[0]
+        order = np.argsort(along, kind="stable")
+        D = along[order]
         for low, high, alpha in (
             (p.low95, p.high95, 0.15),
             (p.curve_low95, p.curve_high95, 0.3),
@@ -105,13 +113,14 @@ def _against(compared: Sequence[Compared]) -> Figure:
         known = np.isfinite(guess)
         new = c.in_fit != "yes"
         left.plot(force[known], guess[known], "." if new else "+", ms=3, alpha=0.6)
-        right.plot(c.curve.displacement[known], c.residual[known], lw=0.8, alpha=0.7)
+        right.plot(_along(c.prediction)[0][known], c.residual[known], lw=0.8, alpha=0.7)
         ends += [*force[known], *guess[known]]
     line = [min(ends), max(ends)]
     left.plot(line, line, "k-", lw=0.6)
     left.set(xlabel="measured [N]", ylabel="predicted [N]", title="+: used by the fit")
     right.axhline(0, color="k", lw=0.6)
-    right.set(xlabel="displacement [mm]", ylabel="predicted - measured [N]", title="differences")
+    along = _along(compared[0].prediction)[1] if compared else ""
+    right.set(xlabel=along, ylabel="predicted - measured [N]", title="differences")
     if len(compared) > MAX_CURVES:
         figure.suptitle(f"the first {MAX_CURVES} of {len(compared)} curves; {_ALL}")
     return figure

@@ -23,8 +23,9 @@ from jaxtrachea.fitting.parameters import DECLARED
 from jaxtrachea.fitting.refusals import depths, untested
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.vectors import tilt_of
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.prediction.core import Estimate, OffMidline, Predicted, Response, predicted
+from jaxtrachea.prediction.core import Estimate, Predicted, Response, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import (
@@ -37,7 +38,7 @@ from jaxtrachea.prediction.sources import (
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 #: Parts of parameters that say nothing of a skeleton.
-AT_CONTACT = ("contact", "press")
+AT_CONTACT = ("contact", "time", "press")
 #: Error of the linear band at its ends, in half-widths, from which it is called bent.
 BENT = 0.5
 
@@ -77,6 +78,7 @@ class CurvePrediction:
         model_se: standard deviation of the error of the model between the positions of the fit, N;
             (N,); 0 at one of them, and where too few tell it.
         model_quantile: of a 95 % interval in `model_se`.
+        time: s; (N,); None where the force does not relax.
     """
 
     specimen: str
@@ -103,6 +105,7 @@ class CurvePrediction:
     joint_side_se: np.ndarray | None = None
     model_se: np.ndarray | float = 0.0
     model_quantile: float = 0.0
+    time: np.ndarray | None = None
 
     def _half(self, sigma: np.ndarray | float) -> np.ndarray:
         """Half of a band with noise of a standard deviation, N; (N,)."""
@@ -149,6 +152,7 @@ def predict_sources(
     sigmas: Sequence[np.ndarray | None] | None = None,
     batch: int = 64,
     aside: Sequence[tuple[float, tuple[float, float]]] | None = None,
+    times: Sequence[np.ndarray] | None = None,
 ) -> list[CurvePrediction]:
     """Predictions for many curves in one program.
 
@@ -161,19 +165,24 @@ def predict_sources(
         batch: curves computed together.
         aside: contact angle, rad, and direction of the tool of each; None: on the midline, along
             the normal.
+        times: of every displacement of each, s, where the force relaxes.
     """
     turned = [(0.0, (1.0, 0.0))] * len(s) if aside is None else list(aside)
     run = program(predicted, stored.study.model)
     errors = model_errors(stored, [source.lane for source in sources])
     sources = [_widened(source, errors.get(source.lane)) for source in sources]
     most = _rounded(max(map(len, displacements)), 32)
-    padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
+
+    def pad(rows):
+        return np.stack([np.pad(v, (0, most - len(v)), mode="edge") for v in rows])
+
+    padded = pad(displacements)
     places = np.where(np.isnan(s), float(stored.study.model.geometry.length) / 2, s)
 
     def stack(name):
         return np.stack([getattr(source, name) for source in sources])
 
-    columns = [Estimate._make(map(stack, Estimate._fields)), places, padded]
+    estimates = Estimate._make(map(stack, Estimate._fields))
     presses = zip(sources, s, padded, strict=True)
     slack = np.stack(
         [
@@ -181,27 +190,29 @@ def predict_sources(
             for (source, at, D), how in zip(presses, turned, strict=True)
         ]
     )
-    off = None
+    motion = Motion(places, padded, time=None if times is None else pad(times))
     if any(how != (0.0, (1.0, 0.0)) for how in turned):
         phis, ways = zip(*turned, strict=True)
-        off = OffMidline(jnp.asarray(np.array(phis, float)), jnp.asarray(np.array(ways, float)))
+        motion = motion._replace(phi_c=np.array(phis, float), direction=np.array(ways, float))
     blend = stack("blend")
     out: dict[int, CurvePrediction] = {}
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
         # A rounded corner is another program; mostly all curves have one, or none.
-        arrays = columns if np.isnan(blend[members]).all() else [*columns, blend]
+        rounded = not np.isnan(blend[members]).all()
+        arrays = estimates, motion._replace(blend=blend if rounded else None), slack
         size = min(batch, _rounded(max(len(members), 1), 8))
         for first in range(0, len(members), size):
             at = members[first : first + size]
             rows = np.pad(at, (0, size - len(at)), mode="edge")
-            more = {"slack": slack} | ({} if off is None else {"aside": off})
-            of_rows, more = jax.tree.map(lambda v, rows=rows: jnp.asarray(v[rows]), (arrays, more))
-            part = jax.tree.map(np.asarray, run(*of_rows, **more))
+            of_rows = jax.tree.map(lambda v, rows=rows: jnp.asarray(v[rows]), arrays)
+            part = jax.tree.map(np.asarray, run(*of_rows))
             for row, k in enumerate(at):
                 own = jax.tree.map(lambda v, row=row: v[row], part)
                 sigma = None if sigmas is None else sigmas[k]
                 where = (s[k], *turned[k])
                 found = _on_host(stored, sources[k], where, displacements[k], own, sigma)
+                if times is not None:
+                    found = _in_time(stored, sources[k], found, np.asarray(times[k], np.float64))
                 out[k] = _with_misfit(stored, sources[k], errors.get(sources[k].lane), found)
     return [out[k] for k in range(len(sources))]
 
@@ -420,6 +431,7 @@ def predict(
     trial: str | None = None,
     phi: float = 0.0,
     direction: tuple[float, float] = (1.0, 0.0),
+    time: ArrayLike | Sequence[float] | None = None,
 ) -> CurvePrediction:
     """A curve that was not measured, from a finished fit.
 
@@ -443,16 +455,21 @@ def predict(
         phi: contact angle from the anterior midline, rad; with direction: of a skeleton of
             deforming cross-sections.
         direction: of the tool's displacement along the inward normal and the circumference.
+        time: of every displacement, s, never falling, where the force relaxes: from rest before
+            the first, with the elastic force even in time between two.
 
     Raises:
-        ValueError: a position outside the tube, a displacement that is no finite number, a specimen
-            or trial that the fit does not have, one without an estimate; with the cure.
+        ValueError: a position outside the tube, a displacement that is no finite number, a time
+            that the fit needs or does not have, or that falls, a specimen or trial that the fit
+            does not have, one without an estimate; with the cure.
     """
     D = np.atleast_1d(np.asarray(displacement, np.float64))
     if D.ndim != 1 or not D.size or not np.isfinite(D).all():
         raise ValueError("displacement: expected a finite number or a vector of them, mm")
     check_position(results, s)
     check_aside(results, phi, direction)
+    check_timed(results, time is not None, "time")
+    times = None if time is None else [_times(time, D)]
     if specimen is None:
         specimen = _only_specimen(results)
     elif specimen not in (names := pressed(results).specimens):
@@ -461,7 +478,56 @@ def predict(
     if not source.status.predicts:
         raise ValueError(f"{specimen}: {source.message or source.status.message}")
     along = float(direction[0]), float(direction[1])
-    return predict_sources(results, [source], [float(s)], [D], aside=[(float(phi), along)])[0]
+    aside = [(float(phi), along)]
+    return predict_sources(results, [source], [float(s)], [D], aside=aside, times=times)[0]
+
+
+def _times(time: ArrayLike | Sequence[float], displacement: np.ndarray) -> np.ndarray:
+    """Times as a vector.
+
+    Raises:
+        ValueError: not one for each displacement, one that is not finite, or that falls.
+    """
+    t = np.atleast_1d(np.asarray(time, np.float64))
+    if t.shape != displacement.shape:
+        raise ValueError(
+            f"time has {t.size} numbers, displacement {displacement.size}; expected one for each"
+        )
+    if not np.isfinite(t).all() or np.any(np.diff(t) < 0):
+        raise ValueError("time: expected finite numbers that never fall, s")
+    return t
+
+
+def _in_time(
+    stored: FitResult, source: CurveParameters, found: CurvePrediction, time: np.ndarray
+) -> CurvePrediction:
+    """The prediction with its time, and what of that no record of the fit has."""
+    fitted = pressed(stored)
+    curves = [c for c, k in zip(fitted.curves, fitted.lane, strict=True) if k == source.lane]
+    longest = max((c.time[-1] - c.time[0] for c in curves if c.time is not None), default=np.inf)
+    message = found.message
+    if found.status.predicts and time[-1] - time[0] > longest * (1 + 1e-9):
+        message = "; ".join(
+            filter(None, [message, f"extrapolated from records of at most {longest:.3g} s"])
+        )
+    return dataclasses.replace(found, time=time, message=message)
+
+
+def check_timed(results: FitResult, given: bool, what: str) -> None:
+    """Refuse a press without the time that a fit needs, and one with a time that it does not read.
+
+    Raises:
+        ValueError: with the cure.
+    """
+    relaxes = results.study.model.relaxes
+    if relaxes and not given:
+        raise ValueError(
+            f"the force of this fit relaxes (relaxation = "
+            f"{results.study.model.options.relaxation!r}), so that it follows from how fast the "
+            f"tool comes; give {what}"
+        )
+    if given and not relaxes:
+        raise ValueError(f"this fit is elastic, its force knows no time; leave {what} out")
 
 
 def check_aside(results: FitResult, phi: float, direction: tuple[float, float]) -> None:

@@ -31,7 +31,7 @@ def _place(p: CurvePrediction, i: int) -> Row:
         "phi [deg]": float(np.degrees(p.phi)),
         "tilt [deg]": float(np.degrees(tilt_of(p.direction))),
         "displacement [mm]": float(p.displacement[i]),
-    }
+    } | ({} if p.time is None else {"time [s]": float(p.time[i])})
 
 
 def prediction_rows(

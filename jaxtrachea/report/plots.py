@@ -14,6 +14,7 @@ from jaxtrachea.fitting.result import FitResult, unknown_label
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
+from jaxtrachea.measurements.curve import Curve
 
 #: Residuals that bands are made of at most, intervals of displacement, and samples in one at least.
 BANDED, BINS, FEWEST = 400_000, 60, 20
@@ -59,8 +60,15 @@ def _panels(result: FitResult) -> list[int]:
     return [order[i] for i in [*range(half), *rest]]
 
 
+def _along(curve: Curve) -> tuple[np.ndarray, str]:
+    """What a curve is drawn along: a whole record by its time, else the displacement."""
+    if curve.rise is None or curve.time is None:
+        return curve.displacement, "displacement [mm]"
+    return curve.time - curve.time[0], "time [s]"
+
+
 def draw_fit(result: FitResult, prediction: Prediction):
-    """Data (dots) and fitted force (line) by displacement; side force and markers beside."""
+    """Data (dots) and fitted force (line), see `_along`; side force and markers beside."""
     shown = _panels(result)
     few = result.lanes <= 3
     with_joints = prediction.joints is not None and few
@@ -77,10 +85,11 @@ def draw_fit(result: FitResult, prediction: Prediction):
             model = curve.force + prediction.force[lane, t, :n]
             step = max(1, n // 60)
             label = plain(curve.trial) if len(curves) <= 12 else None
-            axis.plot(curve.displacement[::step], curve.force[::step], ".", color=colour, ms=4)
-            axis.plot(curve.displacement, model, "-", color=colour, lw=1.2, label=label)
+            along, head = _along(curve)
+            axis.plot(along[::step], curve.force[::step], ".", color=colour, ms=4)
+            axis.plot(along, model, "-", color=colour, lw=1.2, label=label)
         name = plain(lane_label(result, lane))
-        axis.set(title=name, xlabel="displacement [mm]", ylabel="force [N]")
+        axis.set(title=name, xlabel=head, ylabel="force [N]")
         if 1 < len(curves) <= 12:
             axis.legend(ncols=2, title="dots: measured, lines: model", title_fontsize=7)
         if side is not None:
@@ -126,7 +135,7 @@ def _draw_joints(axis, result, prediction, lane, colours) -> None:
 
 
 def draw_residuals(result: FitResult, prediction: Prediction):
-    """Force residuals, model - data, against displacement, and their distribution.
+    """Force residuals, model - data, against displacement or time, and their distribution.
 
     Of many lanes those that failed are left out, the worst of the others are lines, and all of them
     bands over these.
@@ -138,16 +147,17 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     if many and result.succeeded.any():
         lanes = [lane for lane in worst_first(result) if result.succeeded[lane]]
     lined = set(lanes[: ONE_BY_ONE // 2] if many else lanes)
-    pooled, depths = [], []
+    pooled, depths, head = [], [], ""
     for lane in lanes:
         for t, curve in enumerate(result.study.curves[lane]):
             n = len(curve.force)
             peak = np.max(np.abs(curve.force))
             r = 100 * prediction.force[lane, t, :n] / (peak if peak > 0 else 1)
             pooled.append(r)
-            depths.append(curve.displacement)
+            along, head = _along(curve)
+            depths.append(along)
             if lane in lined:
-                left.plot(curve.displacement, r, lw=0.7, alpha=0.6)
+                left.plot(along, r, lw=0.7, alpha=0.6)
     values, depth = np.concatenate(pooled), np.concatenate(depths)
     seen = np.isfinite(values)
     values, depth = values[seen], depth[seen]
@@ -156,7 +166,7 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     left.axhline(0, color="k", lw=0.6)
     shown = f" of {len(lanes)} fits (bands), the {len(lined)} worst as lines" if many else ""
     left.set(
-        xlabel="displacement [mm]",
+        xlabel=head,
         ylabel="(model - data) / peak [%]",
         title=f"force residuals{shown}",
     )

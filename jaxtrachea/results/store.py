@@ -140,6 +140,9 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         used = np.where(kind.precision > 0, kind.data, np.nan)
         columns[kind.name] = [used[k, t, : len(c.force)] for k, t, c in rows]
         columns[f"{kind.name}_residual"] = [left[k, t, : len(c.force)] for k, t, c in rows]
+    if study.model.relaxes:
+        columns["time"] = [c.time for c in curves]
+        group["rise"] = np.array([c.rise or (0, len(c.force)) for c in curves], np.int64)
     for name, parts in columns.items():
         values = np.concatenate(parts)
         group.create_dataset(name, data=values, **_packing(values))
@@ -200,6 +203,7 @@ def read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]
     column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
     direction = numeric(group, "direction")
     observed = _observed(group)
+    rise = numeric(group, "rise").astype(int).tolist() if "rise" in group else None
     curves = []
     texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
     for i, (specimen, trial, source) in enumerate(texts):
@@ -216,10 +220,15 @@ def read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]
                 sigma=None if np.isnan(sigma).all() else sigma,
                 source=source,
                 direction=(float(direction[i][0]), float(direction[i][1])),
-                **{name: v if v.ndim == 1 else v[part] for name, v in observed.items()},
+                rise=None if rise is None else (rise[i][0], rise[i][1]),
+                **{name: v if name in _OF_RINGS else v[part] for name, v in observed.items()},
             )
         )
     return tuple(curves), numeric(group, "lane").astype(int), names["files"]
+
+
+#: Fields of a curve that have no axis of samples.
+_OF_RINGS = ("joint_rings", "end_rings")
 
 
 def _observed(group: Any) -> dict[str, Any]:
@@ -227,7 +236,7 @@ def _observed(group: Any) -> dict[str, Any]:
 
     Rings are numbered, with no axis of samples.
     """
-    out: dict[str, Any] = {}
+    out: dict[str, Any] = {"time": numeric(group, "time")} if "time" in group else {}
     if "joints" in group:
         used = np.isfinite(numeric(group, "joint_residual"))
         out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.whole_record import speed_of
 from jaxtrachea.trials.polynomials import Stack, compare
 
 #: Halves of what may be air, as shares of the travel, and the share of its force that a trial gains
@@ -44,7 +45,8 @@ def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
 
     Args:
         curves: of any number of specimens and positions; those alone at theirs, or without one,
-            are passed over.
+            are passed over. Whole records are compared in their first loading, with others as
+            quick.
 
     Returns:
         The largest difference first.
@@ -53,8 +55,8 @@ def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
     for c in curves:
         if c.s_c is None:
             continue
-        place = round(c.s_c, 1), round(c.phi_c, 3), c.direction
-        groups.setdefault((c.specimen, *place), []).append(c)
+        place = round(c.s_c, 1), round(c.phi_c, 3), c.direction, _pace(c)
+        groups.setdefault((c.specimen, *place), []).append(c.rising)
     several = [g for g in groups.values() if len(g) > 1]
     found = []
     for block in _blocks(several):
@@ -75,6 +77,16 @@ def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
                 numbers = float(seen.share[k]), float(seen.noise[k]), seen.force[k]
                 found.append(Difference(tuple(odd[k]), *numbers))
     return sorted(found, key=lambda d: -d.share)
+
+
+def _pace(curve: Curve) -> int | None:
+    """Speed of the first loading of a whole record, which its force follows; in steps of 20 %."""
+    if curve.rise is None or curve.time is None:
+        return None
+    first = curve.rising
+    assert first.time is not None
+    speed = speed_of(first.time, first.displacement)
+    return round(np.log(speed) / 0.2) if speed > 0 else None
 
 
 def _blocks(groups: Sequence[list[Curve]]) -> Iterator[list[list[Curve]]]:

@@ -86,8 +86,8 @@ def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "expected s, D, phi, tilt, specimen or trial"),
-        ("75", "expected s, D, phi, tilt, specimen or trial"),
+        ("", "expected s, D, phi, tilt, speed, hold, specimen or trial"),
+        ("75", "expected s, D, phi, tilt, speed, hold, specimen or trial"),
         ("s=75", "no displacement D"),
         ("D=2", "no contact position s"),
         ("s=75,D=two", "neither a length nor a range"),
