@@ -174,8 +174,8 @@ def relaxed_press(
     force, d_force = relaxed.force, in_order(slopes.force)
     corner = None if pressed.corner is None else slopes.force[len(elastic)]
     if softens:
-        at = jnp.where(load == 0, 1, load)[None]
-        d_ratio = (pressed.d_force - ratio[None] * pressed.d_load) / at
+        divisor = jnp.where(load == 0, 1, load)[None]
+        d_ratio = (pressed.d_force - ratio[None] * pressed.d_load) / divisor
         d_ratio = jnp.where((load == 0)[None], 0, d_ratio)
         d_force = ratio[None] * d_force + d_ratio * force[None]
         force, corner = ratio * force, None if corner is None else ratio * corner

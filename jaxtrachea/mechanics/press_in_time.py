@@ -122,6 +122,7 @@ def _press_in_time(
     skipped = order != PressStatus.OK
     solved = _in_time(time, moved, skipped, unit.w_C, law, relaxation, elastic, options)
     status = jnp.where(skipped, order, solved.status)
+    assert solved.load is not None
     if softening is not None:
         apart = relaxation.skeleton is not None
         way = way_of(solved.load, unit.w_C, law) if apart else moved
@@ -145,6 +146,7 @@ def _press_in_time(
 
 def _softened(solved: Equilibrium, status, softening: Softening, way):
     """The press with the softening of a way; past the fold of that the sample is PAST_FOLD."""
+    assert solved.load is not None
     there = jnp.isfinite(solved.force)
     folded = there & (~jnp.isfinite(way) | softening.past_peak(way))
     ratio = softening.ratio(jnp.where(there & ~folded, way, 0))

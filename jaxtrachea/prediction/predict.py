@@ -190,10 +190,12 @@ def predict_sources(
             for (source, at, D), how in zip(presses, turned, strict=True)
         ]
     )
-    motion = Motion(places, padded, time=None if times is None else pad(times))
+    time = None if times is None else jnp.asarray(pad(times))
+    motion = Motion(jnp.asarray(places), jnp.asarray(padded), time=time)
     if any(how != (0.0, (1.0, 0.0)) for how in turned):
         phis, ways = zip(*turned, strict=True)
-        motion = motion._replace(phi_c=np.array(phis, float), direction=np.array(ways, float))
+        phi_c, direction = (jnp.asarray(np.array(v, float)) for v in (phis, ways))
+        motion = motion._replace(phi_c=phi_c, direction=direction)
     blend = stack("blend")
     out: dict[int, CurvePrediction] = {}
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):

@@ -1,6 +1,7 @@
 """Rows of predictions.csv, bands.csv, joints.csv and errors.csv (docs/after_a_fit.md)."""
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ def _cell(value: float) -> object:
     return None if np.isnan(value) else float(value)
 
 
-def _place(p: CurvePrediction, i: int) -> Row:
+def _place(p: CurvePrediction, i: int) -> dict[str, Any]:
     return {
         "specimen": p.specimen,
         "trial": p.trial,
