@@ -10,7 +10,7 @@ import pytest
 from run_cli import run
 
 FITS = Path(__file__).parents[1] / "fits"
-SPEEDS = FITS / "three_speeds"
+SPEEDS, AFM = FITS / "three_speeds", FITS / "afm_relaxation"
 
 
 def load(path):
@@ -60,3 +60,25 @@ def test_three_speeds_tell_what_lasts_and_what_relaxes(tmp_path, monkeypatch, ca
         assert rows[name]["verdict"] == "identifiable"
         assert float(rows[name]["value"]) == pytest.approx(truth[name], rel=0.02)
     compare(out, json.loads((SPEEDS / "expected.json").read_text()))
+
+
+@pytest.mark.slow
+def test_the_record_of_a_microscope_is_fitted_by_two_branches(tmp_path, monkeypatch, capsys):
+    """Numbers that the record does not tell are not compared: the misfit and the onset are."""
+    out, known = tmp_path / "out", json.loads((AFM / "expected.json").read_text())
+    assert run(monkeypatch, capsys, "fit", AFM / "fit.toml", "--out", out)[0] == 0
+    rows = estimates(out)
+    assert float(rows["onset"]["value"]) == pytest.approx(known["onset"], abs=1e-4)
+    assert rows["k_1"]["verdict"] == "at bound"
+    with (out / "summary.csv").open(newline="") as stream:
+        (summary,) = csv.DictReader(stream)
+    assert float(summary["rms_over_peak"]) == pytest.approx(known["rms_over_peak"], rel=0.05)
+
+
+@pytest.mark.slow
+def test_two_branches_predict_a_withdrawal_that_an_elastic_press_does_not():
+    script = load(AFM / "held_out.py")
+    known = json.loads((AFM / "expected.json").read_text())["predicted"]
+    for law, expected in known.items():
+        assert script.errors(law, script.record())[1] == pytest.approx(expected, rel=0.1)
+    assert known["prony-2"] < 0.2 * known["off"]
