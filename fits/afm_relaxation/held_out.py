@@ -60,12 +60,13 @@ def errors(law: str, curve: Curve) -> tuple[float, float]:
     level = level_of(study.model.options)
     material = level.material({name: jnp.asarray(v) for name, v in values.items()})
     time = None if law == "off" else curve.time
-    motion = Motion(80.0, curve.displacement, onset=values["onset"], time=time)
+    place, way, onset = (jnp.asarray(v) for v in (80.0, curve.displacement, values["onset"]))
+    motion = Motion(place, way, onset=onset, time=None if time is None else jnp.asarray(time))
     force = np.asarray(level.response(table_1(), material, motion).force) + values["force_offset"]
     off = (force - curve.force) / np.ptp(curve.force)
     seen = curve.time <= top + SEEN
     later = ~seen & (curve.time <= top + PREDICTED)
-    return tuple(float(np.sqrt(np.mean(off[part] ** 2))) for part in (seen, later))
+    return float(np.sqrt(np.mean(off[seen] ** 2))), float(np.sqrt(np.mean(off[later] ** 2)))
 
 
 def record() -> Curve:
