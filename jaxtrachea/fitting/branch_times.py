@@ -4,15 +4,12 @@ A branch that fades within a sample is a stiffness of no time, and one that outl
 a spring: strength and time of neither are estimates, however small their local errors.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from jaxtrachea.fitting.relaxing import span_of
 from jaxtrachea.relaxation.laws import LAWS, OF_SKELETON
-
-if TYPE_CHECKING:
-    from jaxtrachea.fitting.result import FitResult
 
 
 def _product(name: str) -> tuple[str, ...]:
@@ -26,14 +23,14 @@ def _product(name: str) -> tuple[str, ...]:
     return (f"tau_1{part}", *ratios)
 
 
-def unsampled_time(result: "FitResult", lane: int, i: int) -> str:
+def unsampled_time(result: Any, lane: int, i: int) -> str:
     """Why the branch of an unknown is no estimate, in words; "": it is, or there is no branch.
 
     Its time, with the 95 % interval, has to lie between the least step of the samples and the
     longest record.
 
     Args:
-        result: the fit.
+        result: the `FitResult`.
         lane: of it.
         i: unknown of the lane.
     """
@@ -67,7 +64,7 @@ def _to(high: float) -> str:
 
 
 def _interval(
-    result: "FitResult", lane: int, names: tuple[str, ...], of: tuple[str, str]
+    result: Any, lane: int, names: tuple[str, ...], of: tuple[str, str]
 ) -> tuple[float, float]:
     """95 % interval of a product of numbers, some of which may be held."""
     log, slope = 0.0, np.zeros(result.theta.shape[1])
