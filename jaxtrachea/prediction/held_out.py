@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -324,7 +324,7 @@ def _slopes(stored: FitResult, own, sources, theta, own_study: Study) -> list[np
     run = program(force_and_slope, stored.study.model)
     value = np.stack([source.value for source in sources])
 
-    def first(name):
+    def first(name) -> Any:
         found = getattr(lanes, name)
         return None if found is None else found[:, 0]
 

@@ -24,14 +24,16 @@ def _cell(value: float) -> object:
 
 
 def _place(p: CurvePrediction, i: int) -> Row:
-    return {
+    clock: Row = {} if p.time is None else {"time [s]": float(p.time[i])}
+    where: Row = {
         "specimen": p.specimen,
         "trial": p.trial,
         "s [mm]": _cell(p.s),
         "phi [deg]": float(np.degrees(p.phi)),
         "tilt [deg]": float(np.degrees(tilt_of(p.direction))),
         "displacement [mm]": float(p.displacement[i]),
-    } | ({} if p.time is None else {"time [s]": float(p.time[i])})
+    }
+    return where | clock
 
 
 def prediction_rows(
