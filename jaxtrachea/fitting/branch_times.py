@@ -30,7 +30,7 @@ def unsampled_time(result: Any, lane: int, i: int) -> str:
     longest record.
 
     Args:
-        result: the fit, a `FitResult`.
+        result: the `FitResult`.
         lane: of it.
         i: unknown of the lane.
     """

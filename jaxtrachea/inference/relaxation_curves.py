@@ -101,7 +101,7 @@ def relaxation(result: FitResult, of: Whose, at: np.ndarray, part: str) -> Band:
 
     def function(free, value):
         gamma, tau = branches_of(result.study.model, free, value, part)
-        return 1 + jnp.sum(gamma * jnp.exp(-jnp.asarray(at)[:, None] / tau), axis=1)
+        return 1 + jnp.exp(-jnp.asarray(at)[:, None] / tau[None]) @ gamma
 
     return _band(result, of, function)
 
@@ -112,9 +112,9 @@ def moduli(result: FitResult, of: Whose, at: np.ndarray, part: str) -> tuple[Ban
     def function(storage: bool):
         def of_free(free, value):
             gamma, tau = branches_of(result.study.model, free, value, part)
-            x = 2 * jnp.pi * jnp.asarray(at)[:, None] * tau
+            x = 2 * jnp.pi * jnp.asarray(at)[:, None] * tau[None]
             share = 1 / (1 + 1 / (x * x)) if storage else 1 / (x + 1 / x)
-            return (1.0 if storage else 0.0) + jnp.sum(gamma * share, axis=1)
+            return (1.0 if storage else 0.0) + share @ gamma
 
         return _band(result, of, of_free)
 

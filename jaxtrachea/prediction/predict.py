@@ -11,6 +11,7 @@ is then infinite wherever that combination acts): each has a `PredictionStatus`.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -173,11 +174,11 @@ def predict_sources(
     sources = [_widened(source, errors.get(source.lane)) for source in sources]
     most = _rounded(max(map(len, displacements)), 32)
 
-    def pad(rows):
+    def pad(rows) -> Any:
         return np.stack([np.pad(v, (0, most - len(v)), mode="edge") for v in rows])
 
     padded = pad(displacements)
-    places = np.where(np.isnan(s), float(stored.study.model.geometry.length) / 2, s)
+    places: Any = np.where(np.isnan(s), float(stored.study.model.geometry.length) / 2, s)
 
     def stack(name):
         return np.stack([getattr(source, name) for source in sources])

@@ -1,7 +1,6 @@
 """Rows of predictions.csv, bands.csv, joints.csv and errors.csv (docs/after_a_fit.md)."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -24,15 +23,17 @@ def _cell(value: float) -> object:
     return None if np.isnan(value) else float(value)
 
 
-def _place(p: CurvePrediction, i: int) -> dict[str, Any]:
-    return {
+def _place(p: CurvePrediction, i: int) -> Row:
+    clock: Row = {} if p.time is None else {"time [s]": float(p.time[i])}
+    where: Row = {
         "specimen": p.specimen,
         "trial": p.trial,
         "s [mm]": _cell(p.s),
         "phi [deg]": float(np.degrees(p.phi)),
         "tilt [deg]": float(np.degrees(tilt_of(p.direction))),
         "displacement [mm]": float(p.displacement[i]),
-    } | ({} if p.time is None else {"time [s]": float(p.time[i])})
+    }
+    return where | clock
 
 
 def prediction_rows(

@@ -107,9 +107,10 @@ def conditions_along(found: Sequence[Difference]) -> list[str]:
 def conditions_of(curve: Curve) -> dict[str, float]:
     """What is known of a trial besides its curve: its conditions, its speed, its number."""
     known = dict(curve.conditions)
-    if curve.time is not None and curve.time.size > 1 and curve.time[-1] > curve.time[0]:
-        way = float(np.ptp(curve.displacement))
-        known["speed [mm/s]"] = way / float(curve.time[-1] - curve.time[0])
+    first = curve.rising
+    if first.time is not None and first.time.size > 1 and first.time[-1] > first.time[0]:
+        way = float(np.ptp(first.displacement))
+        known["speed [mm/s]"] = way / float(first.time[-1] - first.time[0])
     if numbers := _NUMBER.findall(curve.trial):
         known[_NUMBER_OF_TRIAL] = float(numbers[-1])
     return known

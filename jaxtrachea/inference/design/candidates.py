@@ -119,6 +119,11 @@ def check(study: Study) -> None:
         ValueError: naming the parameters; or a joint study.
     """
     study.refuse_joint("a design")
+    if study.model.relaxes:
+        raise ValueError(
+            f"a design has no speed and no hold, and the force of this model relaxes (relaxation = "
+            f"{study.model.options.relaxation!r}); choose places with relaxation = 'off'"
+        )
     own = [p.name for p in study.free if p.scope == "trial"]
     if len(own) == len(study.free):
         raise ValueError(
