@@ -195,13 +195,13 @@ def test_relaxation_and_moduli_have_the_truth_in_their_bands(fitted):
 
 def test_force_against_speed_has_the_truth_and_the_records(fitted):
     rows = table_of(fitted / "out" / "rates.csv")
-    model = [row for row in rows if row["force"]]
+    model = [row for row in rows if row["force [N]"]]
     speed = column(model, "speed [mm/s]")
     truth = [
         force_at(np.array([2 / v]), np.array([0, 2 / v]), np.array([0, 2.0]))[0] for v in speed
     ]
-    np.testing.assert_allclose(column(model, "force"), truth, rtol=0.01)
-    seen = [row for row in rows if row["measured"]]
+    np.testing.assert_allclose(column(model, "force [N]"), truth, rtol=0.01)
+    seen = [row for row in rows if row["measured [N]"]]
     np.testing.assert_allclose(sorted(column(seen, "speed [mm/s]")), [0.2, 2.0], rtol=0.02)
     flags = {row["extrapolated"] for row in model if not 0.19 < float(row["speed [mm/s]"]) < 2.1}
     assert flags == {"True"}

@@ -81,10 +81,10 @@ def _of(result: FitResult, of: Whose) -> Curves:
     )
 
 
-def _cells(name: str, band: Band, i: int) -> Cells:
+def _cells(name: str, band: Band, i: int, unit: str = "") -> Cells:
     return {
-        name: float(band.value[i]), f"{name}_low95": float(band.low[i]),
-        f"{name}_high95": float(band.high[i]),
+        f"{name}{unit}": float(band.value[i]), f"{name}_low95{unit}": float(band.low[i]),
+        f"{name}_high95{unit}": float(band.high[i]),
     }  # fmt: skip
 
 
@@ -122,10 +122,10 @@ def rate_rows(found: list[Curves]) -> Iterator[Cells]:
             }  # fmt: skip
             for i, v in enumerate(r.speed.tolist()):
                 beyond = bool(v < 0.999 * low or v > 1.001 * high)
-                cells = _cells("force", r.force, i)
+                cells = _cells("force", r.force, i, " [N]")
                 yield {**where, "speed [mm/s]": v, **cells, "extrapolated": beyond}
             for v, force in r.measured.tolist():
-                yield {**where, "speed [mm/s]": v, "measured": force, "extrapolated": False}
+                yield {**where, "speed [mm/s]": v, "measured [N]": force, "extrapolated": False}
 
 
 def energy_rows(found: list[Curves]) -> Iterator[Cells]:
