@@ -201,7 +201,8 @@ def test_old_faults():
             assert (curve.displacement.min(), curve.displacement.max()) == (0, 4)
     curve = finish(held, ReadOptions())
     assert curve.force.size == 200
-    (remark,) = curve.usage.remarks
+    remark, speed = curve.usage.remarks
+    assert speed.startswith("k_1 is that of")
     assert remark == "hold of 10 s at the peak left out: the force relaxes by 32 %"
     (kept,) = finish(held, ReadOptions(loading="all")).usage.remarks
     assert "every sample is used, with a hold of 10 s" in kept
