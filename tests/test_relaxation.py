@@ -136,13 +136,12 @@ def test_records_a_thousand_times_as_slow_have_the_same_forces():
 def test_a_bonded_contact_is_linear_and_the_same_in_parallel():
     t, elastic = journey()
     found = run(t, elastic, *two(), unilateral=False)
-    x, lost = fading(t, two())
-    parallel = bonded_in_parallel(x, lost, elastic, two().gamma)
+    parallel = jax.jit(lambda b: bonded_in_parallel(*fading(t, b), elastic, b.gamma))(two())
     np.testing.assert_allclose(parallel, found.force, rtol=0, atol=1e-14)
     assert found.force.min() < -0.5
-    vectors = jnp.stack([elastic, 2 * elastic, -elastic], axis=-1)
+    vectors = np.asarray(elastic)[:, None] * np.array([1.0, 2, -1])
     together = run(t, vectors, *two(), unilateral=False)
-    expected = found.force[:, None] * jnp.asarray([[1.0, 2, -1]])
+    expected = np.asarray(found.force)[:, None] * np.array([1.0, 2, -1])
     np.testing.assert_allclose(together.force, expected, rtol=0, atol=1e-14)
     with pytest.raises(ValueError, match="unilateral=False"):
         run(t, vectors, *two())
@@ -162,12 +161,13 @@ def lanes():
 
 @pytest.mark.parametrize("unilateral", [True, False])
 def test_many_lanes_are_each_as_if_alone(unilateral):
+    @jax.jit
     def one(t, elastic, gamma, tau):
         return relax(t, elastic, Branches(gamma, tau), unilateral)
 
     together = jax.jit(jax.vmap(one))(*lanes())
     twice = jax.jit(jax.vmap(jax.vmap(one), in_axes=(0, 0, 0, None)))(
-        *(jnp.stack([v, v]) for v in lanes()[:3]), lanes()[3]
+        *(np.stack([v, v]) for v in lanes()[:3]), lanes()[3]
     )
     for i, given in enumerate(zip(*lanes(), strict=True)):
         alone = one(*given)
@@ -180,6 +180,7 @@ def test_many_lanes_are_each_as_if_alone(unilateral):
 def test_derivatives_in_both_modes_are_those_of_differences(unilateral):
     t, elastic = (v[1:] for v in journey(40))  # before the first sample there is a corner
 
+    @jax.jit
     def of(elastic, log_gamma, log_tau):
         given = Branches(jnp.exp(log_gamma), jnp.exp(log_tau))
         return tuple(relax(t, jnp.asarray(elastic), given, unilateral))
@@ -207,10 +208,10 @@ def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilater
     axes = (0, 0, None, None, None)
     value, by = jax.jit(jax.vmap(beside, axes))(t, elastic, *given)
     expected = jax.jit(jax.vmap(jax.jacfwd(of, argnums=(2, 3, 4)), axes))(t, elastic, *given)
-    plain = jax.vmap(of, axes)(t, elastic, *given)
+    plain = jax.jit(jax.vmap(of, axes))(t, elastic, *given)
     for i in (0, 1):
         np.testing.assert_allclose(value[i], plain[i], rtol=0, atol=1e-13)
-        rows = jnp.moveaxis(jnp.concatenate(expected[i], axis=-1), -1, 1)
+        rows = np.moveaxis(np.concatenate(expected[i], axis=-1), -1, 1)
         np.testing.assert_allclose(by[i], rows, rtol=0, atol=1e-11)
     assert relax_with_derivatives(t[0], elastic[0], elastic[:1], two())[1].elastic is None
 
@@ -222,10 +223,14 @@ def test_directions_chain_a_law_of_few_numbers_to_its_branches():
     def of(given):
         return branches("power", dict(zip(("gamma", "beta"), given, strict=True)), span)
 
-    made, along = of(given), jax.tree.map(jnp.transpose, jax.jacfwd(of)(given))
-    _, by = relax_with_derivatives(t, elastic, elastic[None], made, along=along)
-    expected = jax.jacfwd(lambda v: relax(t, elastic, of(v)).force)(given)
-    np.testing.assert_allclose(by.force[1:], expected.T, rtol=0, atol=1e-12)
+    @jax.jit
+    def both(given):
+        along = jax.tree.map(jnp.transpose, jax.jacfwd(of)(given))
+        _, by = relax_with_derivatives(t, elastic, elastic[None], of(given), along=along)
+        return by.force, jax.jacfwd(lambda v: relax(t, elastic, of(v)).force)(given)
+
+    force, expected = both(given)
+    np.testing.assert_allclose(force[1:], expected.T, rtol=0, atol=1e-12)
 
 
 def test_no_path_gives_more_work_than_was_put_in():
