@@ -30,7 +30,7 @@ from jaxtrachea.fitting.information import information
 from jaxtrachea.mechanics.reactions import deflect_dense
 from jaxtrachea.mechanics.sections.material import from_wall
 from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
-from jaxtrachea.scene import session
+from jaxtrachea.scene import step
 from jaxtrachea.scene.simulation import surface
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.tube import make_tube
@@ -92,8 +92,8 @@ def simulated(s):
 def stepped(s):
     path = poses(s)
     here = path.rotation[0], path.translation[0]
-    state = session._start(scene(), *here)
-    _, found, press = session._step(scene(), MATERIAL, state, *here)
+    state = step._start(scene())
+    _, found, press = step.move_tool(scene(), MATERIAL, state, *here)
     return found.force, surface(scene(), *press), found.joints
 
 
