@@ -12,10 +12,12 @@ from jaxtrachea.fitting import forward_residual
 from jaxtrachea.fitting.few_samples import serves
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.refusals import mixed_in_time
 from jaxtrachea.fitting.residual import of_press, of_trials, residual, residual_value
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.trachea.geometry import Geometry
@@ -156,7 +158,31 @@ def test_a_curve_without_a_time_is_refused(time, message):
         build_study([other], GEOMETRY, RELAXING)
 
 
+@pytest.mark.parametrize("cause", ["before", "turning back", "window"])
+def test_a_loading_cut_out_of_what_it_remembers_is_refused(cause):
+    """What went before is in its force; the same loading from rest is fitted."""
+    rising = curve(28.0).rising
+    whole = Usage(recorded=90, used=rising.force.size, low=0.0, high=3.0, left_out={"after": 20})
+    build_study([dataclasses.replace(rising, usage=whole)], GEOMETRY, RELAXING)
+    cut = dataclasses.replace(whole, left_out={cause: 20})
+    with pytest.raises(ValueError, match="which a force that relaxes remembers"):
+        build_study([dataclasses.replace(rising, usage=cut)], GEOMETRY, RELAXING)
+
+
+def test_an_elastic_model_is_told_that_it_mixes_a_record():
+    curves = [curve(28.0), curve(62.0, "b").rising]
+    assert "1 of 2 curves are whole records" in (mixed_in_time(curves, Options()) or "")
+    assert mixed_in_time(curves, RELAXING) is None
+    assert mixed_in_time(curves[1:], Options()) is None
+
+
 def test_a_few_samples_say_nothing_of_a_past():
     study = build_study([curve(28.0)], GEOMETRY, RELAXING)
-    many = dataclasses.replace(study, lanes=study.lanes)
+    long = jax.tree.map(lambda v: np.repeat(v, 2, axis=2) if v.ndim == 3 else v, study.lanes)
+    many = dataclasses.replace(
+        study, lanes=long._replace(value=study.lanes.value, index=study.lanes.index)
+    )
     assert not serves(many, Settings(), 10_000)
+    assert serves(
+        dataclasses.replace(many, lanes=many.lanes._replace(time=None)), Settings(), 10_000
+    )

@@ -67,12 +67,12 @@ def _with_zeros(measurements, study, printed: set[str]):
 
 
 def _with_depths(measurements, study, printed: set[str]):
-    """The measurements with a note on curves that go deeper than the model was tested.
+    """The measurements with notes on curves beyond what the model was tested for, or made for.
 
     Nothing is fitted yet: a sought onset is taken where its curve shows it.
     """
     from jaxtrachea.fitting.onset import counted_from
-    from jaxtrachea.fitting.refusals import deeper_than_validated
+    from jaxtrachea.fitting.refusals import deeper_than_validated, mixed_in_time
 
     model = study.model
     curves = [c for lane in study.curves for c in lane]
@@ -81,13 +81,12 @@ def _with_depths(measurements, study, printed: set[str]):
         for row, lane in zip(study.first_touch, study.curves, strict=True)
         for d in row[: len(lane)]
     ]
-    note = deeper_than_validated(
+    deep = deeper_than_validated(
         curves, model.options, float(model.geometry.radius), touch, counted_from(study.parameters)
     )
-    if note is None:
-        return measurements
-    _print("note", [note], printed)
-    return dataclasses.replace(measurements, notes=(*measurements.notes, note))
+    notes = [n for n in (deep, mixed_in_time(curves, model.options)) if n is not None]
+    _print("note", notes, printed)
+    return dataclasses.replace(measurements, notes=(*measurements.notes, *notes))
 
 
 def print_notes(measurements, printed: set[str] | None = None) -> None:

@@ -11,11 +11,15 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.parameters import OF_THE_PRESS, Parameter
 from jaxtrachea.measurements.observed import VECTORS, WITHOUT_VECTORS
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.usage import CAUSES
 from jaxtrachea.measurements.vectors import observed
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.level import Level, Size
 from jaxtrachea.mechanics.levels.line import VALIDATED_DEPTH
 from jaxtrachea.mechanics.levels.options import Options
+
+#: Causes of samples left out of a record after which its force is not that of rest.
+_REMEMBERED = ("before", "turning back", "window")
 
 
 class Refusal(NamedTuple):
@@ -94,8 +98,18 @@ def check_curve(curve: Curve, size: Size, options: Options, onset: float = 0.0) 
             f"contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm",
             place=where,
         )
-    if (refused := level_of(options).admits(curve, size, onset)) is not None:
+    level = level_of(options)
+    if (refused := level.admits(curve, size, onset)) is not None:
         raise InputError.like(refused, place=where)
+    if level.relaxes and curve.usage is not None and curve.rise is None:
+        cut = [CAUSES[cause] for cause in _REMEMBERED if cause in curve.usage.left_out]
+        if cut:
+            raise InputError(
+                f"{' and '.join(cut)} of the record are left out, which a force that relaxes "
+                "remembers",
+                place=where,
+                cure='take loading = "record", or relaxation = "off"',
+            )
     if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
         found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
         raise InputError(found, place=where)
@@ -196,6 +210,17 @@ def untested(options: Options, radius: float, depth: float, counted: str = "") -
     """
     most = tested_depth(options, radius)
     return f"the model was tested to D = {most:.3g} mm{counted}" if depth > most else ""
+
+
+def mixed_in_time(curves: Sequence[Curve], options: Options) -> str | None:
+    """A sentence on whole records that an elastic model is fitted to; None: there are none."""
+    whole = sum(c.rise is not None for c in curves)
+    if not whole or level_of(options).relaxes:
+        return None
+    return (
+        f"{whole} of {len(curves)} curves are whole records, with all of their speeds, holds and "
+        "unloading: an elastic model mixes them; choose relaxation = 'uniform', or loading = 'last'"
+    )
 
 
 def deeper_than_validated(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea.fitting.force_share import offsets
 from jaxtrachea.fitting.forward_residual import answer
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
@@ -65,7 +66,7 @@ class Rate(NamedTuple):
         depth: mm from first touch.
         speed: mm/s; (N,).
         force: N.
-        measured: speed and force of each record there; (M, 2).
+        measured: speed and force of each record there, without its offset; (M, 2).
     """
 
     s: float
@@ -179,6 +180,7 @@ def rates(result: FitResult, of: Whose) -> Iterator[Rate]:
         if curve.phi_c == 0 and tuple(curve.direction) == (1.0, 0.0):
             places.setdefault(np.nan if curve.s_c is None else curve.s_c, []).append((t, curve))
     free, value = _estimate(result, of)
+    zero = offsets(study, result.theta)[of.lane]
     for s, own in places.items():
         points, deepest = [], []
         for t, curve in own:
@@ -186,7 +188,7 @@ def rates(result: FitResult, of: Whose) -> Iterator[Rate]:
             assert rise.time is not None
             depth = depths(rise.displacement, float(result.first_touch[of.lane, t]), options)
             deepest.append(float(depth.max()))
-            points.append((speed_of(rise.time, rise.displacement), float(rise.force[-1])))
+            points.append((speed_of(rise.time, rise.displacement), float(rise.force[-1] - zero[t])))
         depth, measured = max(deepest), np.array(points)
         alike = np.array(deepest) > 0.98 * depth
         measured = measured[alike & (measured[:, 0] > 0)]

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, Int
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.holds import FEWEST, Hold
 from jaxtrachea.measurements.segments import Segments
+from jaxtrachea.measurements.usage import RELAXED
 
 #: Cure of a record that cannot be read with its time.
 ELASTIC = 'or fit one loading without its time (loading = "last")'
@@ -119,10 +120,10 @@ def remarks_of(
         yield f"ramps of {named}: is the unit of time right?"
     holds: tuple[Hold, ...] = (*found.steps, *(() if found.hold is None else (found.hold,)))
     most = max((hold.relaxed for hold in holds), default=0.0)
-    if most >= STILL and whole:
+    if most >= RELAXED and whole:
         longest = max(hold.duration for hold in holds)
         yield f"in holds of up to {longest:.3g} s the force falls by up to {100 * most:.2g} %"
-    elif most >= STILL:
+    elif most >= RELAXED:
         used = [v for p, v in speeds.items() if p.start < found.stop <= p.stop]
         at = f"{used[0] if used else high:.2g} mm/s"
         yield f"k_1 is that of {at}: in the hold the force falls by {100 * most:.2g} %"

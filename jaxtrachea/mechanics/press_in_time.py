@@ -124,7 +124,6 @@ def _press_in_time(
     status = jnp.where(skipped, order, solved.status)
     assert solved.load is not None
     if softening is not None:
-        assert solved.load is not None
         apart = relaxation.skeleton is not None
         way = way_of(solved.load, unit.w_C, law) if apart else moved
         solved, status = _softened(solved, status, softening, way)
@@ -152,7 +151,6 @@ def _softened(solved: Equilibrium, status, softening: Softening, way):
     folded = there & (~jnp.isfinite(way) | softening.past_peak(way))
     ratio = softening.ratio(jnp.where(there & ~folded, way, 0))
     force = jnp.where(folded, jnp.nan, ratio * solved.force)
-    assert solved.load is not None
     depth, load = (jnp.where(folded, jnp.nan, v) for v in (solved.depth, solved.load))
     status = jnp.where(folded, PressStatus.PAST_FOLD, status)
     return solved._replace(force=force, depth=depth, load=load), status

@@ -40,8 +40,8 @@ class Stack(NamedTuple):
 
     @classmethod
     def of(cls, groups: Sequence[Sequence[Curve]]) -> "Stack":
-        """The trials of some groups as recorded; of a whole record its first loading."""
-        curves = [c.rising for g in groups for c in g]
+        """The trials of some groups as recorded."""
+        curves = [c for g in groups for c in g]
         sizes, counts = np.array([c.force.size for c in curves]), np.array([*map(len, groups)])
         D, F = (np.concatenate([getattr(c, n) for c in curves]) for n in ("displacement", "force"))
         first = np.cumsum(counts) - counts

@@ -50,6 +50,9 @@ class Relaxing(Level):
     hides_refused = _of_inner("hides_refused")
     name = _of_inner("name")
     tested = _of_inner("tested")
+    tested_angle = _of_inner("tested_angle")
+    deepest = _of_inner("deepest")
+    wall_radius = _of_inner("wall_radius")
     thickness = _of_inner("thickness")
     check = _of_inner("check")
     without_negative = _of_inner("without_negative")
@@ -69,18 +72,6 @@ class Relaxing(Level):
     def parts(self) -> tuple[str, ...]:
         """What relaxes, and the law."""
         return (*self.inner.parts, f"relaxing ({self.options.relaxation}, {self.options.branches})")
-
-    def tested_angle(self, half_angle: float) -> float:
-        """As the level within."""
-        return self.inner.tested_angle(half_angle)
-
-    def deepest(self, radius: float) -> float:
-        """As the level within."""
-        return self.inner.deepest(radius)
-
-    def wall_radius(self, tube: Geometry, outer: Any) -> Any:
-        """As the level within."""
-        return self.inner.wall_radius(tube, outer)
 
     def needs(self, *, joints: bool) -> frozenset[str]:
         """What the level within needs, and the numbers of the law."""
