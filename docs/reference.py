@@ -243,7 +243,7 @@ def parameters() -> list[str]:
             p.description + (f" `{p.symbol}`" if p.symbol else ""),
             p.needs or "always",
             p.absent or ("0" if p.name in OF_PRESS else "needed"),
-            f"each {p.each}" if p.each else "",
+            f"each {p.varies_by}" if p.varies_by else "",
             *fit,
         ]
         rows.append("| " + " | ".join(cells) + " |")

@@ -54,9 +54,9 @@ TOY = Analysis(
     table=lambda found, lanes: Table([{"played": found.lanes}], title="Toys"),
     section=lambda found: [f"{found.lanes} lanes were played with."],
     warning=lambda found: ["Toys are **no** tools."],
-    shown=lambda found: [f"{found.lanes} toys"],
+    sentences=lambda found: [f"{found.lanes} toys"],
     figures=lambda found: {"toy.png": draw},
-    poor=lambda found: True,
+    unreliable=lambda found: True,
 )
 
 

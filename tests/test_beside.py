@@ -4,8 +4,7 @@ import sys
 import threading
 
 import pytest
-
-from jaxtrachea.cli.beside import beside, load_beside
+from jaxtrachea.cli.requires import load_beside, requires
 
 
 def test_both_are_at_work_at_once_and_have_ended_after_the_block():
@@ -17,7 +16,7 @@ def test_both_are_at_work_at_once_and_have_ended_after_the_block():
         ended.append(name)
         return name
 
-    with beside(draw, "picture") as drawing:
+    with requires(draw, "picture") as drawing:
         meet.wait()
     assert ended == ["picture"]
     assert drawing.result() == "picture"
@@ -27,7 +26,7 @@ def test_an_error_is_raised_where_it_is_asked_for():
     def fail():
         raise OSError(28, "no space left")
 
-    with beside(fail) as drawing:
+    with requires(fail) as drawing:
         pass
     with pytest.raises(OSError, match="no space"):
         drawing.result()

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from jaxtrachea.cli import specification
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.information import held_count, unknown_count
+from jaxtrachea.fitting.information import fixed_count, unknown_count
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
@@ -419,6 +419,6 @@ def test_held_unknowns_are_counted_once():
     held[np.arange(LANES), study.shared[:, 0]] = True
     held[4, 0] = True
     everyone = np.ones(LANES, bool)
-    assert held_count(study, held, everyone) == 2
+    assert fixed_count(study, held, everyone) == 2
     # k_3, 20 k_1, and an offset of each of 30 curves.
     assert unknown_count(study, everyone) == 51

@@ -92,7 +92,7 @@ def test_what_a_level_presses_it_admits(word):
     aside = curve(phi_c=0.5, direction=(0.8, 0.6))
     assert level.admits(curve(), SIZE) is None
     assert (level.admits(aside, SIZE) is None) == level.off_midline
-    assert (level.tested_angle(SIZE.half_angle) > 0.5) == level.off_midline
+    assert (level.validated_angle(SIZE.half_angle) > 0.5) == level.off_midline
     deep = curve(displacement=np.linspace(0, 13, 6))
     assert (level.admits(deep, SIZE) is None) == (level.deepest(SIZE.radius) > 13)
     assert level.admits(deep, SIZE, onset=5.0) is None

@@ -42,7 +42,7 @@ def test_ratio_is_the_root_of_chi_squared_over_its_freedom(sigma):
     known = np.sqrt(np.sum(np.square(left), axis=1) / (len(D) - 1)) / sigma
     np.testing.assert_allclose(found.ratio[:, 0], known, rtol=1e-6)
     wrong = sigma in (SIGMA / 10, SIGMA * 10)
-    assert found.told.tolist() == [[wrong, False]] * 3
+    assert found.flagged.tolist() == [[wrong, False]] * 3
     sentences = MISFIT.section(result)
     assert len(sentences) == wrong
     if wrong:
@@ -64,7 +64,7 @@ def test_few_samples_may_do_so_by_chance():
     result = fit(study, QUICK)
     found = result.misfit
     assert np.mean((found.ratio[:, 0] > 1.5) | (found.ratio[:, 0] < 1 / 1.5)) > 0.3
-    assert np.sum(found.told) <= 2
+    assert np.sum(found.flagged) <= 2
 
 
 def test_eleven_samples_are_told_by_chi_squared():
@@ -80,18 +80,18 @@ def test_eleven_samples_are_told_by_chi_squared():
     )  # fmt: skip
     found = fit(study, QUICK).misfit
     np.testing.assert_allclose(found.ratio[:, 0], [1.6, 1.9], rtol=1e-6)
-    assert found.told[:, 0].tolist() == [False, True]
+    assert found.flagged[:, 0].tolist() == [False, True]
 
 
 @pytest.mark.slow
 def test_outliers_do_not_count_with_a_robust_loss():
     force = lines(2)
     force[:, ::10] += 100 * SIGMA
-    assert compared(force, SIGMA).misfit.told[:, 0].all()
+    assert compared(force, SIGMA).misfit.flagged[:, 0].all()
     found = compared(force, SIGMA, loss="huber").misfit
     assert np.all(np.abs(np.log(found.ratio[:, 0])) < np.log(1.4))
-    assert not found.told.any()
-    assert compared(force, SIGMA / 10, loss="huber").misfit.told[:, 0].all()
+    assert not found.flagged.any()
+    assert compared(force, SIGMA / 10, loss="huber").misfit.flagged[:, 0].all()
 
 
 def test_lanes_of_a_joint_fit_count_together():
@@ -100,7 +100,7 @@ def test_lanes_of_a_joint_fit_count_together():
     k = np.sum(force @ D) / (3 * D @ D)
     known = np.sqrt(np.sum((force - k * D) ** 2) / (3 * len(D) - 1)) / (SIGMA / 3)
     np.testing.assert_allclose(found.ratio[:, 0], known, rtol=1e-6)
-    assert found.told[:, 0].all()
+    assert found.flagged[:, 0].all()
 
 
 def test_estimated_noise_is_not_compared():

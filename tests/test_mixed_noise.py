@@ -104,7 +104,7 @@ def test_markers_beyond_their_noise_are_told():
     for given, told in ((MARKER / 10, True), (MARKER, False), (10 * MARKER, False)):
         result = fitted(marked("A"), Noise(force=FORCE, joints=given))
         found = result.misfit
-        assert found.told[0].tolist() == [False, told]
+        assert found.flagged[0].tolist() == [False, told]
         assert found.ratio[0, 1] == pytest.approx(MARKER / given, rel=0.1)
 
 

@@ -9,7 +9,7 @@ import pytest
 from late import late
 
 from jaxtrachea.mechanics import beam, equilibrium, force_law
-from jaxtrachea.mechanics.press import Options, ligament_beam, local_law, press, touch
+from jaxtrachea.mechanics.press import Options, indentation, ligament_beam, local_law, press
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.material import Material
@@ -149,7 +149,7 @@ def test_per_ring_values():
 
 def test_touch_is_smooth_and_local():
     width, d = 0.2, np.linspace(-1, 1, 401)
-    run = jax.jit(touch, static_argnums=2)
+    run = jax.jit(indentation, static_argnums=2)
     y = np.asarray(run(d, jnp.asarray(0.1), Options(onset_width=width)))
     np.testing.assert_array_equal(y[d <= 0.1], 0)
     beyond = d >= 0.1 + width

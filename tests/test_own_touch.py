@@ -14,7 +14,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.model import columns_of
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
+from jaxtrachea.inference.cross_validation import leave_one_out, with_own_onset
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.pressed import pressed
@@ -85,7 +85,7 @@ def left_out_pairs(study, changes, rows, folder):
     held = np.zeros(study.take(left.lane).lanes.s_c.shape, bool)
     held[np.arange(len(held)), left.trial] = True
     chosen = study.take(left.lane)
-    truth = predictions(chosen, with_own_touch(chosen, held, left.result.theta, TWO).theta).force
+    truth = predictions(chosen, with_own_onset(chosen, held, left.result.theta, TWO).theta).force
     for row in rows:
         lane, trial = left.lane[row], left.trial[row]
         out = study.curves[lane][trial]

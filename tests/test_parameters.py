@@ -40,7 +40,7 @@ def test_page_has_the_declarations_and_no_others():
         assert meaning == p.description + (f" `{p.symbol}`" if p.symbol else "")
         assert needs == (p.needs or "always")
         assert absent == (p.absent or ("0" if p.name in OF_PRESS else "needed"))
-        assert each == (f"each {p.each}" if p.each else "")
+        assert each == (f"each {p.varies_by}" if p.varies_by else "")
         if p.fit is None:
             assert fit == ["not fitted", "", "", ""]
             continue

@@ -8,9 +8,9 @@ from jaxtyping import Float
 
 from jaxtrachea.fitting.curve_noise import weighed_by_curve
 from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.measurements.batch_checks import finish_all
 from jaxtrachea.measurements.curve import Curve, RawCurve, ReadOptions
 from jaxtrachea.measurements.read import DataError, read_measurements
-from jaxtrachea.measurements.together import finish_all
 from jaxtrachea.trials.differences import differing_trials
 from jaxtrachea.trials.repeats import repeat_sentences, trial_remarks
 from jaxtrachea.trials.uneven_noise import uneven_noise

@@ -10,7 +10,7 @@ from measured_files import put, read
 from jaxtrachea.measurements import segments
 from jaxtrachea.measurements.checks import finish
 from jaxtrachea.measurements.curve import RawCurve
-from jaxtrachea.measurements.plausible import doubt
+from jaxtrachea.measurements.plausible import implausible_size
 from jaxtrachea.measurements.read import BadCurve, ReadOptions
 from jaxtrachea.measurements.segments import NoLoading, segment
 from jaxtrachea.measurements.turning import noise, turned_back, turning_points
@@ -57,8 +57,8 @@ KNOWN = {
 def force_of(displacement, zero=0.0):
     """Of a hardening law: none in air, and odd where a record that begins at 0 is drawn outward."""
     depth = displacement - zero
-    drawn = depth[0] == 0 and depth.max() == 0
-    depth = depth if drawn else np.maximum(depth, 0)
+    retracting = depth[0] == 0 and depth.max() == 0
+    depth = depth if retracting else np.maximum(depth, 0)
     return depth + 0.05 * depth**3
 
 
@@ -66,7 +66,7 @@ def zero_of(name):
     return -30.0 if name == "not zeroed" else 0.0
 
 
-def beside(found, first, stop, hole):
+def requires(found, first, stop, hole):
     """How many samples the choice differs by from the truth."""
     outside = int(found.keep[:first].sum() + found.keep[stop:].sum())
     return outside + abs(int((~found.keep[first:stop]).sum()) - hole)
@@ -78,7 +78,7 @@ def test_known_records(name, clock):
     displacement, first, stop, hole = KNOWN[name]
     times = None if clock is None else clock * np.arange(displacement.size)
     found = segment(displacement, force_of(displacement, zero_of(name)), times)
-    assert beside(found, first, stop, hole) <= 2
+    assert requires(found, first, stop, hole) <= 2
     ends = [0, *(part.stop for part in found.parts)]
     assert [part.start for part in found.parts] == ends[:-1]
     assert ends[-1] == displacement.size
@@ -93,7 +93,7 @@ def test_known_records_with_noise(name):
     noisy = displacement + 0.02 * rng.standard_normal(displacement.size)
     force = force_of(displacement, zero_of(name))
     force = force + 0.005 * np.ptp(force) * rng.standard_normal(force.size)
-    assert beside(segment(noisy, force), first, stop, hole) <= 12
+    assert requires(segment(noisy, force), first, stop, hole) <= 12
 
 
 def test_what_is_held():
@@ -248,7 +248,7 @@ def test_usage_is_told():
     ],
 )
 def test_sizes_that_are_hard_to_believe(extent, force, hint):
-    said = doubt(np.array([0.0, extent]), np.array([0.0, force]))
+    said = implausible_size(np.array([0.0, extent]), np.array([0.0, force]))
     assert (hint is None and said is None) or hint in said
 
 

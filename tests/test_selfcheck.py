@@ -10,8 +10,8 @@ import pytest
 from run_cli import run
 
 from jaxtrachea.selfcheck import table
+from jaxtrachea.selfcheck.assess import gap_of
 from jaxtrachea.selfcheck.functions import FUNCTIONS
-from jaxtrachea.selfcheck.judge import gap_of
 from jaxtrachea.selfcheck.page import page, skeleton
 from jaxtrachea.selfcheck.run import run_table
 

@@ -23,6 +23,7 @@ from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.tradeoff import choice as choosing
 from jaxtrachea.tradeoff import measure as measuring
 from jaxtrachea.tradeoff.choice import choose
+from jaxtrachea.tradeoff.cost import Cost
 from jaxtrachea.tradeoff.errors import Errors, relative, remesh, spread
 from jaxtrachea.tradeoff.front import pareto
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
@@ -30,7 +31,6 @@ from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.load import Load
 from jaxtrachea.tradeoff.page import choice_rows, fronts
 from jaxtrachea.tradeoff.plots import QUESTIONS, draw
-from jaxtrachea.tradeoff.price import Cost
 from jaxtrachea.tradeoff.trial import Trial
 
 

@@ -15,8 +15,8 @@ from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
+from jaxtrachea.inference.holdout_groups import companions, holdout_sentence, with_holdout_groups
 from jaxtrachea.inference.repeats import leave_repeats_out, repeats
-from jaxtrachea.inference.together import companions, left_out_together, together_sentence
 from jaxtrachea.measurements.read import BadCurve, Curve, read_measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
@@ -51,7 +51,7 @@ def study_of(curves, groups=TWINS, **scopes):
     table[2] = DEFAULTS["onset"]
     table = [dataclasses.replace(p, scope=scopes.get(p.name, p.scope)) for p in table]
     study = build_study(curves, table_1(), TOTAL, table)
-    return study if groups is None else left_out_together(study, groups)
+    return study if groups is None else with_holdout_groups(study, groups)
 
 
 def missed_by_hand(curves, groups):
@@ -94,7 +94,7 @@ def test_one_curve_left_out_takes_its_twins_along():
     missed = missed_by_hand(curves, TWINS)
     peak = [np.max(np.abs(c.force)) for c in curves]
     np.testing.assert_allclose(left.force, np.sqrt(np.mean(missed**2, axis=1)) / peak, rtol=1e-6)
-    assert together_sentence(left.study.together) == ["Left out together: s30, s90"]
+    assert holdout_sentence(left.study.holdout_groups) == ["Left out together: s30, s90"]
 
 
 def test_groups_merge_positions_and_repeats():
@@ -142,7 +142,7 @@ def test_a_group_across_specimens_and_a_bad_curve():
     # What is known but cannot be used is no mistake of the specification.
     bad = BadCurve("A", "s90", "x.csv", "position", "", "")
     few = [c for c in curves if c.trial != "s90"]
-    study = left_out_together(study_of(few, None), TWINS, [bad])
+    study = with_holdout_groups(study_of(few, None), TWINS, [bad])
     assert [np.flatnonzero(row).tolist() for row in repeats(study).held] == [[0], [1], [2]]
 
 
@@ -171,7 +171,7 @@ def folder(tmp_path, monkeypatch):
         lines += [f"{c.specimen},{c.trial},{c.s_c},{d!r},{f!r}" for d, f in pairs]
     (tmp_path / "data.csv").write_text("\n".join(lines) + "\n")
     free = 'force_offset = { scope = "specimen" }'
-    for name, together, more in (
+    for name, holdout_groups, more in (
         ("line", WITH, free),
         ("through", WITH, ""),
         ("alone", "", ""),
@@ -179,7 +179,7 @@ def folder(tmp_path, monkeypatch):
         ("two", 'together = [["s30", "s90"], ["s90", "s60"]]', ""),
         ("one", 'together = [["s30"]]', ""),
     ):
-        text = SPEC.format(title=name, together=together, more=more)
+        text = SPEC.format(title=name, holdout_groups=holdout_groups, more=more)
         (tmp_path / f"{name}.toml").write_text(text)
     return tmp_path
 
@@ -237,7 +237,7 @@ def test_shipped_twins_are_mirror_images(name):
         for a in curves.values() for b in curves.values()
         if a is not b and abs(a.s_c + b.s_c - 160) < 1e-9
     }  # fmt: skip
-    assert pairs == {tuple(group) for group in spec.data.together or ()}
+    assert pairs == {tuple(group) for group in spec.data.holdout_groups or ()}
     for a, b in pairs:
         scale = np.max(np.abs(curves[a].force))
         np.testing.assert_allclose(curves[a].force, curves[b].force, atol=1e-9 * scale)

@@ -14,7 +14,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import structure
 from jaxtrachea.fitting.study import build_study
-from jaxtrachea.fitting.zeros_told import cells, sentences
+from jaxtrachea.fitting.zero_messages import cells, sentences
 from jaxtrachea.inference.design.press import index_of_presses, of_a_new_press
 from jaxtrachea.measurements.read import Curve, Measurements
 from jaxtrachea.mechanics.press import Options

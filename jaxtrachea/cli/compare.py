@@ -144,11 +144,11 @@ def _left_out_words(models) -> str:
 def _left_out_notes(models) -> list[str]:
     """What is to be said of the refits behind the left-out column; nothing if all is well."""
     from jaxtrachea.inference.cross_validation import refits_sentence
-    from jaxtrachea.inference.together import together_sentence
+    from jaxtrachea.inference.holdout_groups import holdout_sentence
 
     notes = []
     if any(model.left_out is not None for model in models):
-        notes += [f"{text}." for text in together_sentence(models[0].result.study.together)]
+        notes += [f"{text}." for text in holdout_sentence(models[0].result.study.holdout_groups)]
     for model in models:
         if model.left_out is None:
             continue
@@ -172,7 +172,7 @@ def _why_nothing(model) -> str:
     own = [p.name for p in free if p.scope == "trial" and p.name not in OF_THE_PRESS]
     if own:
         return f"{', '.join(own)} belongs to single curves, and no other curve tells of it"
-    apart = " that is not left out with the first" if model.result.study.together else ""
+    apart = " that is not left out with the first" if model.result.study.holdout_groups else ""
     return f"no specimen has a second position or trial{apart}"
 
 

@@ -100,7 +100,7 @@ def describe(options: FitOptions, loaded, measurements, study, analyses: list[st
         workers = min(len(devices), -(-lanes // every))
         batch = shards.slots(study, shards.free_memory(workers))
     else:
-        batch = min(batch, study.most_together)
+        batch = min(batch, study.max_batch)
     return manifest.describe(
         options.spec, root, measurements.sha256(), asked.precision, device,
         lanes=lanes, batch=batch, save_every=every, options=analyses,

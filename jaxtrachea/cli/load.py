@@ -49,7 +49,7 @@ def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[st
 
 def _note_unused_batch(spec, study, printed: set[str]) -> None:
     """A note where fewer lanes are computed together than the specification says."""
-    batch, most = spec.fit.batch, study.most_together
+    batch, most = spec.fit.batch, study.max_batch
     if batch != "auto" and batch > most:
         why = f"of curves as long as these a CPU takes {most} together"
         if study.one_at_a_time:
@@ -59,7 +59,7 @@ def _note_unused_batch(spec, study, printed: set[str]) -> None:
 
 def _with_zeros(measurements, study, printed: set[str]):
     """The measurements with notes on what curves take from their own records."""
-    from jaxtrachea.fitting.zeros_told import sentences
+    from jaxtrachea.fitting.zero_messages import sentences
 
     said = sentences(study)
     _print("note", said, printed)

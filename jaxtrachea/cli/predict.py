@@ -123,7 +123,7 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
 def _asked(stored, texts: Sequence[str]):
     """Sources, positions, displacements, angle with direction, and times, of every --at."""
     from jaxtrachea.measurements.presses import parse_presses
-    from jaxtrachea.prediction.predict import check_aside, check_position, check_timed
+    from jaxtrachea.prediction.predict import check_off_midline, check_position, check_timed
     from jaxtrachea.prediction.pressed import pressed
     from jaxtrachea.prediction.sources import source_of
 
@@ -133,7 +133,7 @@ def _asked(stored, texts: Sequence[str]):
     for text in texts:
         try:
             asked = parse_presses(text, needs_position=needs)
-            check_aside(stored, asked.phi, asked.direction)
+            check_off_midline(stored, asked.phi, asked.direction)
             check_timed(stored, asked.time is not None, "speed (as speed=5 mm/s), and hold")
             names = fitted.specimens if asked.specimen is None else (asked.specimen,)
             if asked.specimen is not None and asked.specimen not in fitted.specimens:
@@ -172,8 +172,8 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
 
     measurements, notes = measured_curves(stored, given)
     curves, unusable = pressable(stored, measurements.curves)
-    curves, unread = as_read(curves, stored.study.model.level)
-    notes += [] if unread is None else [unread]
+    curves, unused = as_read(curves, stored.study.model.level)
+    notes += [] if unused is None else [unused]
     bad = [*measurements.bad, *unusable]
     print_bad(dataclasses.replace(measurements, bad=tuple(bad)))
     if not curves:

@@ -50,7 +50,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.provenance import provenance
     from jaxtrachea.files.table import Table
-    from jaxtrachea.fitting.zeros_told import cells
+    from jaxtrachea.fitting.zero_messages import cells
     from jaxtrachea.measurements.usage_tables import usage_rows, usage_section
     from jaxtrachea.report.fit import report_text
     from jaxtrachea.report.plots import draw_all
@@ -117,4 +117,4 @@ def show(items, folder: Path) -> None:
 
 def poor(findings) -> bool:
     """Whether an analysis came out so that it is not to be relied on."""
-    return any(analysis.poor(found) for analysis, found in findings.found)
+    return any(analysis.unreliable(found) for analysis, found in findings.found)

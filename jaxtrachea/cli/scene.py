@@ -184,7 +184,7 @@ def _chosen(path: Path, spec, staged):
     from jaxtrachea.scene.declare import PlanError
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.levels import full_scene
-    from jaxtrachea.tradeoff.load import doubt
+    from jaxtrachea.tradeoff.load import load_warning
 
     try:
         full = full_scene(spec, staged)
@@ -205,7 +205,7 @@ def _chosen(path: Path, spec, staged):
         except PlanError as error:
             raise Stop(f"{path}: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
-    return staged._replace(**chosen, notes=(*staged.notes, *doubt(choice.others))), choice
+    return staged._replace(**chosen, notes=(*staged.notes, *load_warning(choice.others))), choice
 
 
 def _timed(staged) -> str:
@@ -213,8 +213,8 @@ def _timed(staged) -> str:
     import numpy as np
 
     from jaxtrachea.tradeoff.calls import turn_medians
-    from jaxtrachea.tradeoff.load import Load, doubt
-    from jaxtrachea.tradeoff.price import WORDS, compiled
+    from jaxtrachea.tradeoff.cost import WORDS, compiled
+    from jaxtrachea.tradeoff.load import Load, load_warning
 
     arguments, calls = (staged.scene, staged.material, staged.path), []
     with interrupts() as ctrl_c, progress_bar(transient=True) as bar:
@@ -229,7 +229,7 @@ def _timed(staged) -> str:
         seconds = np.median(turn_medians(calls), axis=1)
     times = zip(seconds, WORDS.values(), strict=True)
     each = ", ".join(f"{1e3 * v:.2g} ms for {what}" for v, what in times)
-    return "\n".join((f"time measured on this machine: {each}", *doubt(load.others())))
+    return "\n".join((f"time measured on this machine: {each}", *load_warning(load.others())))
 
 
 def _for_sweep(path: Path, spec, staged):
@@ -263,7 +263,7 @@ def _levels_of(scene) -> str:
     effects = {e.name: e for e in scene.plan.effects}
     width = ("width",) if scene.plan.options.half_width > 0 else ()
     return "\n".join(
-        f"sweep: {name} {effects[name].level!r}, {effects[name].doubt or effects[name].reason}"
+        f"sweep: {name} {effects[name].level!r}, {effects[name].caveat or effects[name].reason}"
         for name in ("rings", "skeleton", *width)
     )
 

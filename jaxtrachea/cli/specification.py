@@ -11,7 +11,7 @@ from jaxtrachea.fitting.refusals import Refusal, Size, as_read, refusal
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.zeros import without_line, zeros_of
-from jaxtrachea.inference.together import left_out_together
+from jaxtrachea.inference.holdout_groups import with_holdout_groups
 from jaxtrachea.measurements.read import (
     BadCurve,
     Measurements,
@@ -183,8 +183,8 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
         bad.append(BadCurve(*place, kind, error.problem, cure))
     if reasons and not good:
         raise SpecError(reasons[0])
-    good, unread = as_read(good, level_of(options))
-    notes = measurements.notes if unread is None else (*measurements.notes, unread)
+    good, unused = as_read(good, level_of(options))
+    notes = measurements.notes if unused is None else (*measurements.notes, unused)
     return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad), notes=notes)
 
 
@@ -253,7 +253,7 @@ def _with_groups(study: Study, spec: FitSpec, measurements: Measurements) -> Stu
     if not spec.data.together:
         return study
     try:
-        return left_out_together(study, spec.data.together, measurements.bad)
+        return with_holdout_groups(study, spec.data.together, measurements.bad)
     except InputError as error:
         raise SpecError.like(error, key=f"data.together.{error.key}") from None
 

@@ -50,7 +50,7 @@ class Patches(eqx.Module):
         line: the centreline, for s and phi.
         lost: how far the surface at most stands out of each patch (thinning, rounding), mm.
         filled: how far it at most lies inside of it (hollows bridged), mm.
-        doubtful: patches that are not the surface; None: all are.
+        uncertain: patches that are not the surface; None: all are.
     """
 
     shapes: Shape
@@ -58,7 +58,7 @@ class Patches(eqx.Module):
     line: Centreline
     lost: Float[Array, " patches"]
     filled: Float[Array, " patches"]
-    doubtful: Bool[Array, " patches"] | None = None
+    uncertain: Bool[Array, " patches"] | None = None
 
 
 class Touch(eqx.Module):
@@ -215,8 +215,8 @@ def _touch(
     s, phi = skeleton_coordinates(patches.line, point)
     terms = patches.shapes.vertices.shape[2] * tool.vertices.shape[1] * near
     worst = jnp.max(jnp.where(weight > COUNTS, each.status, 0))
-    if patches.doubtful is not None:
-        doubt = jnp.any((weight > COUNTS) & patches.doubtful[chosen])
+    if patches.uncertain is not None:
+        doubt = jnp.any((weight > COUNTS) & patches.uncertain[chosen])
         worst = jnp.where(doubt, jnp.maximum(worst, ContactStatus.NOT_CONVERGED), worst)
     if not search:
         deep = gap < -(tool.radius + jnp.min(shapes.radius))

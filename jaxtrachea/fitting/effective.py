@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fitting.information import held_count, unknown_count
+from jaxtrachea.fitting.information import fixed_count, unknown_count
 from jaxtrachea.fitting.misfit import Residuals, misfit
 from jaxtrachea.fitting.predictions import Prediction
 
@@ -138,7 +138,7 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
     unknowns = np.sum(~held, axis=1).astype(float)
     if study.joint:
         alive = of.succeeded
-        P = unknown_count(study, alive) - held_count(study, held, alive)
+        P = unknown_count(study, alive) - fixed_count(study, held, alive)
         unknowns = np.full(len(n), float(P))
         n, worth = np.full(len(n), np.sum(n[alive])), np.full(len(n), worth[0])
     against = misfit(of)

@@ -8,16 +8,16 @@ import numpy as np
 
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
-from jaxtrachea.fitting.doubt import doubtful, left_in_doubt
 from jaxtrachea.fitting.evaluate import evaluated
 from jaxtrachea.fitting.force_share import MAX_ITERATIONS, changed, next_levels, with_levels
-from jaxtrachea.fitting.information import held_count, marginal, summed_gradient
+from jaxtrachea.fitting.information import fixed_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
     information_per_lane,
     lowest_minima,
     refit_with_noise,
 )
+from jaxtrachea.fitting.needs_review import needs_review, still_needs_review
 from jaxtrachea.fitting.noise import next_sigma, normal_psi2, precision_unit
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
@@ -70,7 +70,7 @@ def fit(
         found = _with_force_share(found, settings, progress)
     result, minima, known = found
     if not settings.verify or study.joint:
-        return dataclasses.replace(result, unexamined=left_in_doubt(result, minima))
+        return dataclasses.replace(result, unexamined=still_needs_review(result, minima))
     return _verified(result, minima, known, settings, progress)
 
 
@@ -141,7 +141,7 @@ def _unproven(result: FitResult, known: Structure) -> np.ndarray:
 def _verified(result, minima: Minima, known: Structure, settings, progress) -> FitResult:
     """With the evidence of `verify`; a better minimum found takes the estimate's place."""
     for turns_left in range(REPLACED, -1, -1):
-        doubts = doubtful(result, minima)
+        doubts = needs_review(result, minima)
         if not doubts.any():
             break
         evidence, better = verify_minimum(
@@ -189,7 +189,7 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     relative = relative_change(study, theta)
     if study.joint:
         pool = marginal(study, pool, held, alive)
-        unknowns = (unknowns or 0) - held_count(study, held, alive)
+        unknowns = (unknowns or 0) - fixed_count(study, held, alive)
     open_ = _open_directions(study, theta, structure)
     u = analyse(
         pool, relative, held,

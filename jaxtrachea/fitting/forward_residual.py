@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.lane import Lane, forces, markers, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
-from jaxtrachea.mechanics.admission import has_solution
 from jaxtrachea.mechanics.levels.level import Motion, Response
+from jaxtrachea.mechanics.validation import has_solution
 from jaxtrachea.trachea.geometry import Geometry
 
 

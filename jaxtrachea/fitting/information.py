@@ -170,7 +170,7 @@ def unknown_count(study: Study, alive: Bool[np.ndarray, " L"]) -> int:
     return int(study.lanes.active[alive].sum()) - k * max(int(np.sum(alive)) - 1, 0)
 
 
-def held_count(study: Study, held: Bool[np.ndarray, "L P"], alive) -> int:
+def fixed_count(study: Study, held: Bool[np.ndarray, "L P"], alive) -> int:
     """Distinct unknowns of the lanes that count and are held on a bound."""
     row, shared = np.arange(len(held))[:, None], study.shared
     mine = (held & (study.lanes.active > 0))[alive]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fitting.information import held_count, unknown_count
+from jaxtrachea.fitting.information import fixed_count, unknown_count
 from jaxtrachea.fitting.lane import Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.study import Study
@@ -46,31 +46,31 @@ class Misfit(NamedTuple):
         ratio: of the residuals to the sigma given: root of chi^2 / (n - P), with a robust loss
             1.4826 times the median of their sizes; NaN where no sigma is given or nothing is left
             over; (lanes, 2).
-        told: whether it is beyond `BEYOND`, and not by chance; of markers only where residuals are
-            larger: what a model may miss in them is given on purpose; (lanes, 2).
+        flagged: whether it is beyond `BEYOND`, and not by chance; of markers only where residuals
+            are larger: what a model may miss in them is given on purpose; (lanes, 2).
     """
 
     ratio: Float[np.ndarray, "lanes 2"]
-    told: Bool[np.ndarray, "lanes 2"]
+    flagged: Bool[np.ndarray, "lanes 2"]
 
     @property
     def growth(self) -> Float[np.ndarray, " lanes"]:
         """Growth of standard errors for residuals beyond the noise given; 1 or more; (lanes,)."""
-        return np.max(np.where(self.told & (self.ratio > 1), self.ratio, 1.0), axis=1)
+        return np.max(np.where(self.flagged & (self.ratio > 1), self.ratio, 1.0), axis=1)
 
 
 def misfit(of: Residuals) -> Misfit:
     """Residuals against the noise given; in a joint fit of all lanes together."""
     study, lanes = of.study, of.study.lanes
     shape = (len(of.samples), 2)
-    ratio, told = np.full(shape, np.nan), np.zeros(shape, bool)
+    ratio, flagged = np.full(shape, np.nan), np.zeros(shape, bool)
     for k, (kinds, given) in enumerate(
         zip((forces(lanes), markers(lanes)), study.noise_given, strict=True)
     ):
         if given and kinds:
-            ratio[:, k], told[:, k] = _against_noise(of, kinds)
-    told[:, 1] &= ratio[:, 1] > 1
-    return Misfit(ratio, told)
+            ratio[:, k], flagged[:, k] = _against_noise(of, kinds)
+    flagged[:, 1] &= ratio[:, 1] > 1
+    return Misfit(ratio, flagged)
 
 
 def _against_noise(of: Residuals, kinds: list[Observed]):
@@ -90,7 +90,7 @@ def _against_noise(of: Residuals, kinds: list[Observed]):
     total, square = np.asarray(of.samples, float), np.nansum(size**2, axis=1)
     if study.joint:
         alive, held = of.succeeded, of.at_bound | (lanes.active <= 0)
-        unknowns = np.array([unknown_count(study, alive) - held_count(study, held, alive)])
+        unknowns = np.array([unknown_count(study, alive) - fixed_count(study, held, alive)])
         count, total, square = (np.sum(v[alive], keepdims=True) for v in (count, total, square))
         size = size[alive].reshape(1, -1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -103,5 +103,5 @@ def _against_noise(of: Residuals, kinds: list[Observed]):
             ratio, left = np.where(left > 0, 1.4826 * np.array(middle), np.nan), MEDIAN * left
         statistic = ratio**2 * left
         chance = np.minimum(chdtrc(left, statistic), chdtr(left, statistic))
-        told = ((ratio > BEYOND) | (ratio < 1 / BEYOND)) & (chance < CHANCE)
-    return (np.broadcast_to(v, (len(of.samples),)) for v in (ratio, told))
+        flagged = ((ratio > BEYOND) | (ratio < 1 / BEYOND)) & (chance < CHANCE)
+    return (np.broadcast_to(v, (len(of.samples),)) for v in (ratio, flagged))

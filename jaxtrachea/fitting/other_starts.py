@@ -18,7 +18,7 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.structure import positions, without_curves
 from jaxtrachea.mechanics.force_law import coefficient, power
-from jaxtrachea.optimisation.batching import batch_size, most_in_cache
+from jaxtrachea.optimisation.batching import batch_size, max_in_cache
 
 #: Indentation over skeleton deflection, and its inverse, of the two starts.
 SOFT = 19.0
@@ -75,7 +75,7 @@ def _compliance(result: FitResult, lanes, theta) -> Float[np.ndarray, "n points 
     read = bare.lanes._replace(joints=None, joint_precision=None)  # their motion is not asked for
     bare = dataclasses.replace(bare, lanes=read)
     # Of few points too: one program.
-    batch = batch_size(TWIN_POINTS**2, most_in_cache(bare.bytes_per_lane))
+    batch = batch_size(TWIN_POINTS**2, max_in_cache(bare.bytes_per_lane))
     c = map_lanes(
         _felt_compliance, bare, theta.reshape(-1, size), batch=batch,
         rows=np.repeat(lanes, points), unoptimised=study.unoptimised(result.lanes),

@@ -8,7 +8,7 @@ from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import leaving_alone, pins
-from jaxtrachea.optimisation.batching import copied_together
+from jaxtrachea.optimisation.batching import copied_at_once
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.status import FitStatus, ProfileEnd
 
@@ -120,7 +120,7 @@ class Sides:
             theta (n, P), statistic (n,), NaN where the fit did not converge.
         """
         thetas, statistics = [np.zeros((0, start.shape[1]))], [np.zeros(0)]
-        copied = copied_together(self.result.study.bytes_per_lane)
+        copied = copied_at_once(self.result.study.bytes_per_lane)
         for first in range(0, len(side), copied):
             part = slice(first, first + copied)
             s, d = side[part], distance[part]

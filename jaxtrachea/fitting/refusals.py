@@ -186,7 +186,7 @@ def as_read(curves: Sequence[Curve], level: Level) -> tuple[Sequence[Curve], str
 
 def tested_depth(options: Options, radius: float) -> float:
     """Depth to which the model was tested, mm; inf without a skeleton (coupling `total`)."""
-    return level_of(options).tested * radius * (1 + 1e-9)  # with what rounding takes
+    return level_of(options).validated_depth * radius * (1 + 1e-9)  # with what rounding takes
 
 
 def depths(
@@ -203,7 +203,7 @@ def depths(
     return np.maximum(depth, 0) if options.contact == "unilateral" else depth
 
 
-def untested(options: Options, radius: float, depth: float, counted: str = "") -> str:
+def unvalidated(options: Options, radius: float, depth: float, counted: str = "") -> str:
     """Whether a press of `depth` goes deeper than the model was tested, in words; "" if not.
 
     `counted`: see `onset.counted_from`.
@@ -249,10 +249,11 @@ def deeper_than_validated(
     if not deep:
         return None
     cure = "cut them off or leave them out where that matters"
-    if level_of(options).tested < VALIDATED_DEPTH["softening"]:
+    if level_of(options).validated_depth < VALIDATED_DEPTH["softening"]:
         cure = "choose skeleton = 'softening' or 'sections'"
     return (
         f"{len(deep)} of {len(curves)} curves go to {max(deep):.3g} mm{counted}; skeleton = "
-        f"{options.skeleton!r} was tested to {most:.3g} mm ({level_of(options).tested:g} of the "
-        f"radius), beyond it the model may be off by more than its bands say; {cure}"
+        f"{options.skeleton!r} was tested to {most:.3g} mm "
+        f"({level_of(options).validated_depth:g} of the radius), beyond it the model may be off by "
+        f"more than its bands say; {cure}"
     )

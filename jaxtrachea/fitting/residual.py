@@ -315,7 +315,7 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
     of_force, of_load = sensitivity(solved, c, contact.law, contact.softening)
 
     def at(onset):
-        return _closed(model).touch(D, onset, blend)
+        return _closed(model).indentation(D, onset, blend)
 
     def slope(onset):
         return jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]

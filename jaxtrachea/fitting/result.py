@@ -535,7 +535,7 @@ def is_own(result: FitResult, lane: int, i: int) -> bool:
     return not (result.study.joint and result.study.unknowns[lane][i][0].scope == "shared")
 
 
-def said_before(result: FitResult, lanes: Sequence[int], lane: int, i: int) -> bool:
+def already_reported(result: FitResult, lanes: Sequence[int], lane: int, i: int) -> bool:
     """Whether an unknown that all lanes share is listed with another of `lanes`, the first good."""
     first = next((k for k in lanes if result.succeeded[k]), lanes[0])
     return not is_own(result, lane, i) and lane != first
@@ -551,7 +551,7 @@ def estimated(result: FitResult) -> list[tuple[int, int]]:
         (lane, i)
         for lane in every
         for i in range(len(result.study.unknowns[lane]))
-        if not said_before(result, every, lane, i)
+        if not already_reported(result, every, lane, i)
     ]
 
 

@@ -31,7 +31,7 @@ from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.levels.level import Closed
 from jaxtrachea.mechanics.press import Contact
 from jaxtrachea.mechanics.softening import Softening
-from jaxtrachea.optimisation.batching import PATHS, most_slots
+from jaxtrachea.optimisation.batching import PATHS, max_slots
 from jaxtrachea.relaxation.laws import names
 
 #: Points of the parameter box, and half its width in decades.
@@ -235,7 +235,7 @@ def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     if study.model.level.closed is None:
         return _seen_of_curves(study, lanes, theta)
     bare = without_curves(study)
-    batch = bare.batch_size(len(study.curves), most_slots())  # of any lanes: one program
+    batch = bare.batch_size(len(study.curves), max_slots())  # of any lanes: one program
     J = map_lanes(_inputs_by_unknowns, bare, theta, rows=lanes, batch=batch)
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]

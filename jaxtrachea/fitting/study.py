@@ -92,8 +92,8 @@ class Study:
         marker_noise: given standard deviation of markers, mm, and share of the tool's displacement
             that it has beside it (see `Noise`); None: estimated.
         joint: whether shared unknowns are one and the same in all lanes.
-        together: names of trials, in groups that are left out together; see
-            `inference.together.left_out_together`.
+        holdout_groups: names of trials, in groups that are left out together; see
+            `inference.holdout_groups.with_holdout_groups`.
         balance: what weighs the same, see `Weighting`.
         change_points: displacement at which each curve shows its first touch, mm, NaN where it
             shows none; (lanes, T); None where no onset is sought.
@@ -111,7 +111,7 @@ class Study:
     noise_given: tuple[bool, bool]
     marker_noise: tuple[float, float] | None = None
     joint: bool = False
-    together: tuple[tuple[str, ...], ...] = ()
+    holdout_groups: tuple[tuple[str, ...], ...] = ()
     balance: Balance = "curve"
     change_points: Float[np.ndarray, "lanes T"] | None = None
     record_zeros: Float[np.ndarray, "lanes T 3"] | None = None
@@ -237,7 +237,7 @@ class Study:
         return 8 * (5 * len(self.free) * entries + 8 * self.size**2 + 500)
 
     @property
-    def most_together(self) -> int:
+    def max_batch(self) -> int:
         """Lanes worth computing together at most, a power of two (see `optimisation.batching`).
 
         Joint studies and other devices have no such limit; 1 where lanes are fitted
@@ -247,11 +247,11 @@ class Study:
             return 1
         if self.joint or not batching.on_cpu():
             return 1 << 30
-        return batching.most_in_cache(self.bytes_per_lane)
+        return batching.max_in_cache(self.bytes_per_lane)
 
     def batch_size(self, total: int, most: int) -> int:
-        """Lanes computed together, of `total`, of `most` and `most_together`: a size of few."""
-        return batching.batch_size(total, min(most, self.most_together))
+        """Lanes computed together, of `total`, of `most` and `max_batch`: a size of few."""
+        return batching.batch_size(total, min(most, self.max_batch))
 
     def unoptimised(self, count: int) -> bool:
         """Whether `count` lanes take less time than it takes to optimise their program.
@@ -413,9 +413,9 @@ def _admitted(
     for curve in curves:
         if (refused := refusal(curve, size, options, table)) is not None:
             raise refused.error
-    curves, unread = as_read(curves, level_of(options))
-    if unread is not None:
-        warnings.warn(unread, stacklevel=3)
+    curves, unused = as_read(curves, level_of(options))
+    if unused is not None:
+        warnings.warn(unused, stacklevel=3)
     return curves, table
 
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fitting.doubt import APART, natural_sizes
 from jaxtrachea.fitting.lane import data_weight
 from jaxtrachea.fitting.minima import Minima
+from jaxtrachea.fitting.needs_review import APART, natural_sizes
 from jaxtrachea.fitting.other_starts import soft_starts, twins
 from jaxtrachea.fitting.profile_search import Sides, find_ends
 from jaxtrachea.fitting.result import FitResult

@@ -58,7 +58,7 @@ def resolved(
     wanted = any(p.name == "force_slope" and not p.fixed for p in table)
     looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
     if not (wanted or looked):
-        return Resolved(_without_idle_line(table), {}, None)
+        return Resolved(_without_flat_line(table), {}, None)
     zeros = zeros_of(curves, sigma, table)
     if wanted:
         for curve, reason in zip(curves, without_line(curves, zeros), strict=True):
@@ -81,7 +81,7 @@ def resolved(
             for k in np.flatnonzero(shown[p.name]).tolist():
                 taken[curves[k].specimen, curves[k].trial].add(p.name)
         out.append(p)
-    return Resolved(_without_idle_line(out), taken, zeros)
+    return Resolved(_without_flat_line(out), taken, zeros)
 
 
 def zeros_of(
@@ -136,7 +136,7 @@ def _with_line(parameters: Sequence[Parameter], options: Options) -> tuple[Param
     return (*table, DEFAULTS["force_slope"]) if offset.auto else table
 
 
-def _without_idle_line(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+def _without_flat_line(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """The table without a line that is held at 0: such a model has none."""
     return tuple(
         p for p in parameters if not (p.name == "force_slope" and p.fixed and p.value == 0)

@@ -79,7 +79,9 @@ class AnalysisResults:
 
     def at(self, place: str) -> Iterator[tuple["Analysis", Any]]:
         """The analyses that the report has at this place."""
-        return ((analysis, found) for analysis, found in self.found if analysis.place == place)
+        return (
+            (analysis, found) for analysis, found in self.found if analysis.report_section == place
+        )
 
     @property
     def profiles(self) -> Profiles | None:
@@ -111,16 +113,16 @@ class Analysis:
         datasets: arrays of `found` in its group of results.h5; none: it has no such group.
         attributes: of this group, likewise.
         meanings: enumeration of the codes in a dataset, by its name.
-        place: of its section in report.md and of its tables on the terminal: `estimates`, before
-            the quality of the fit; `quality`, with it; `checks`, after it; `data`, after what is
-            used of the data; `design`: it belongs to that command.
+        report_section: where its section stands in report.md, and its tables on the terminal:
+            `estimates`, before the quality of the fit; `quality`, with it; `checks`, after it;
+            `data`, after what is used of the data; `design`: it belongs to that command.
         table: for people, in the report under its title and on the terminal, for (found, lanes
             that are listed); None: it has none.
         section: paragraphs of the report, below its table.
         warning: paragraphs below the table of estimates.
-        shown: sentences on the terminal, below its table.
+        sentences: sentences on the terminal, below its table.
         figures: what draws each picture, by name of the file.
-        poor: whether it came out so that the command ends with exit code 1.
+        unreliable: whether it came out so that the command ends with exit code 1.
     """
 
     name: str
@@ -138,13 +140,13 @@ class Analysis:
     datasets: tuple[str, ...] = ()
     attributes: tuple[str, ...] = ()
     meanings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    place: Place = "checks"
+    report_section: Place = "checks"
     table: Callable[[Any, list[int]], Table | None] = lambda found, lanes: None
     section: Callable[[Any], list[str]] = lambda found: []
     warning: Callable[[Any], list[str]] = lambda found: []
-    shown: Callable[[Any], Iterable[str]] = lambda found: ()
+    sentences: Callable[[Any], Iterable[str]] = lambda found: ()
     figures: Callable[[Any], Mapping[str, Callable[[], Any]]] = lambda found: {}
-    poor: Callable[[Any], bool] = lambda found: False
+    unreliable: Callable[[Any], bool] = lambda found: False
 
     def __post_init__(self):
         """Refuse a place that no report has: what stands there would never be seen.
@@ -152,7 +154,7 @@ class Analysis:
         Raises:
             ValueError: with the places there are.
         """
-        check_word("place", self.place, Place)
+        check_word("place", self.report_section, Place)
 
     def report(self, found: Any, lanes: list[int]) -> list[str]:
         """Paragraphs of the report: its table, where it has one, and its section."""
@@ -164,7 +166,7 @@ class Analysis:
         """Its table on the terminal, where it has one, and its sentences."""
         table = self.table(found, lanes)
         yield from () if table is None else [table]
-        yield from self.shown(found)
+        yield from self.sentences(found)
 
     def wanted(self, request: Request) -> bool:
         """Whether the request asks for it."""

@@ -27,7 +27,7 @@ from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.batching import copied_together
+from jaxtrachea.optimisation.batching import copied_at_once
 
 Kind = Literal["parametric", "residual"]
 #: Replicates below which the ends of a 95 % interval are not read off.
@@ -113,13 +113,13 @@ def bootstrap(
     seen = predictions(result.study, result.theta)
     one = dataclasses.replace(settings, starts=1, verify=False)
     thetas, usable = [], []
-    together = max(copied_together(result.study.bytes_per_lane) // count, 1)
+    together = max(copied_at_once(result.study.bytes_per_lane) // count, 1)
     for first in range(0, result.lanes, together):
         lanes = np.arange(first, min(first + together, result.lanes))
-        drawn = _draw(result, seen, lanes, count, kind, block, settings.seed)
+        sampled = _draw(result, seen, lanes, count, kind, block, settings.seed)
         rows = lanes.repeat(count)
         chosen = result.study.take(rows)
-        again = fit(dataclasses.replace(chosen, lanes=drawn), one, starts=result.theta[rows])
+        again = fit(dataclasses.replace(chosen, lanes=sampled), one, starts=result.theta[rows])
         thetas.append(again.theta.reshape(len(lanes), count, -1))
         usable.append(again.succeeded.reshape(len(lanes), count))
         if progress is not None:
@@ -171,8 +171,8 @@ def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) 
         for channel in channels:
             model = channel.data[lane] + np.nan_to_num(getattr(seen, channel.name)[lane])
             found[channel.name].append(model + noise[channel.name])
-    drawn = result.study.take(lanes.repeat(count)).lanes
-    return drawn._replace(**{name: np.concatenate(parts) for name, parts in found.items()})
+    sampled = result.study.take(lanes.repeat(count)).lanes
+    return sampled._replace(**{name: np.concatenate(parts) for name, parts in found.items()})
 
 
 def _kinds(result: FitResult) -> list[tuple[Observed, int]]:

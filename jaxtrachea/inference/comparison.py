@@ -100,7 +100,7 @@ def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
                     "not; compare them on presses along the normal, from a file without those"
                 )
             raise ValueError(f"{pair} use different samples; give both the same [data] section")
-        if sorted(map(sorted, study.together)) != sorted(map(sorted, first.together)):
+        if sorted(map(sorted, study.holdout_groups)) != sorted(map(sorted, first.holdout_groups)):
             raise ValueError(
                 f"{pair} leave out different trials together; give both the same data.together"
             )

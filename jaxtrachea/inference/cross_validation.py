@@ -15,8 +15,8 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.inference.holdout_groups import companions
 from jaxtrachea.inference.residuals import rms
-from jaxtrachea.inference.together import companions
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -88,11 +88,11 @@ def curves_to_leave_out(study: Study) -> list[tuple[int, int]]:
     pairs = [
         (k, t)
         for k, curves in enumerate(study.curves)
-        for t, out in enumerate(companions(curves, study.together))
+        for t, out in enumerate(companions(curves, study.holdout_groups))
         if len(out) < len(curves)
     ]
     if not pairs:
-        apart = ", not all left out together" if study.together else ""
+        apart = ", not all left out together" if study.holdout_groups else ""
         raise ValueError(
             f"needs at least two curves that share their parameters{apart}; found none"
         )
@@ -122,7 +122,7 @@ def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOu
     rows = np.arange(len(lane))
     held = np.zeros(lanes.s_c.shape, bool)
     for row, (k, t) in enumerate(zip(lane, trial, strict=True)):
-        held[row, companions(study.curves[k], study.together)[t]] = True
+        held[row, companions(study.curves[k], study.holdout_groups)[t]] = True
     result, touched, seen = refitted(chosen, held, whole.theta[lane], settings, progress)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     observed = lanes.precision[rows, trial] > 0
@@ -168,7 +168,7 @@ def own_unknowns(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Bool[np.nda
     return own
 
 
-class OwnTouch(NamedTuple):
+class OwnOnset(NamedTuple):
     """Estimates with the onset and offset of curves left out.
 
     Attributes:
@@ -180,12 +180,12 @@ class OwnTouch(NamedTuple):
     converged: Bool[np.ndarray, " lanes"]
 
 
-def with_own_touch(
+def with_own_onset(
     study: Study,
     held: Bool[np.ndarray, "lanes T"],
     theta: Float[np.ndarray, "lanes P"],
     settings: Settings,
-) -> OwnTouch:
+) -> OwnOnset:
     """Theta with onset and offset of the trials `held` fitted to them, all other unknowns kept.
 
     Where the trials have none of their own, `theta` itself.
@@ -198,7 +198,7 @@ def with_own_touch(
     """
     own = own_unknowns(study, held)
     if not own.any():
-        return OwnTouch(theta, np.ones(len(theta), bool))
+        return OwnOnset(theta, np.ones(len(theta), bool))
     alone = without(study, ~held)
     alone = dataclasses.replace(
         alone, lanes=alone.lanes._replace(active=np.where(own, study.lanes.active, 0))
@@ -207,7 +207,7 @@ def with_own_touch(
     kept = np.repeat(np.where(own, np.nan, theta), settings.starts, axis=0)
     starts = np.where(np.isnan(kept), starts, kept)
     found = fit(alone, settings, starts=starts)
-    return OwnTouch(found.theta, found.succeeded | ~own.any(axis=1))
+    return OwnOnset(found.theta, found.succeeded | ~own.any(axis=1))
 
 
 def refitted(
@@ -216,7 +216,7 @@ def refitted(
     estimate: Float[np.ndarray, "lanes P"],
     settings: Settings,
     progress,
-) -> tuple[FitResult, OwnTouch, Prediction]:
+) -> tuple[FitResult, OwnOnset, Prediction]:
     """Every lane fitted without the trials `held`, and what it then says of all its trials.
 
     Besides the starts of a fit one is the estimate of all data, so that no refit ends in a minimum
@@ -234,5 +234,5 @@ def refitted(
     """
     plain = dataclasses.replace(settings, verify=False)
     result = fit(without(study, held), plain, progress, beside=estimate)
-    touched = with_own_touch(study, held, result.theta, plain)
+    touched = with_own_onset(study, held, result.theta, plain)
     return result, touched, predictions(study, touched.theta)

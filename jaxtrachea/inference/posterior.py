@@ -109,19 +109,23 @@ def from_line(x: Float[Array, " P"], lane: Lane) -> Float[Array, " P"]:
 
 
 def log_density(
-    model: FitModel, drawn: tuple[bool, bool], lane: Lane, sigma: Float[Array, "2"], x: Array
+    model: FitModel,
+    noise_sampled: tuple[bool, bool],
+    lane: Lane,
+    sigma: Float[Array, "2"],
+    x: Array,
 ) -> Float[Array, ""]:
     """Log posterior on the real line, up to a constant.
 
     Args:
         model: what is fitted (static).
-        drawn: whether sigma of forces and of markers is unknown.
+        noise_sampled: whether sigma of forces and of markers is unknown.
         lane: the lane's arrays.
         sigma: as for `evaluate`; where it is unknown, what the drawn one is relative to.
         x: (Q,) unknowns, then logarithms of the relative noise drawn.
     """
     P = lane.lower.shape[0]
-    u, log_noise = x[:P], _spread(drawn, x[P:])
+    u, log_noise = x[:P], _spread(noise_sampled, x[P:])
     lane = lane._replace(balance=jnp.ones_like(lane.balance))
     value = residual_value(model, from_line(u, lane), lane)
     rho, _ = weights(model, value, lane, sigma * jnp.exp(log_noise))
@@ -133,10 +137,10 @@ def log_density(
     return jnp.where(jnp.isfinite(density), density, -jnp.inf)
 
 
-def _spread(drawn: tuple[bool, bool], values: Array) -> Float[Array, "2"]:
+def _spread(noise_sampled: tuple[bool, bool], values: Array) -> Float[Array, "2"]:
     """Drawn numbers at their places among (force, markers), 0 elsewhere."""
     out = jnp.zeros(2, values.dtype)
-    return out.at[jnp.flatnonzero(jnp.array(drawn), size=sum(drawn))].set(values)
+    return out.at[jnp.flatnonzero(jnp.array(noise_sampled), size=sum(noise_sampled))].set(values)
 
 
 class _Target(NamedTuple):
@@ -148,19 +152,19 @@ class _Target(NamedTuple):
     root: Any
 
 
-def _density(model: FitModel, drawn, target: _Target):
+def _density(model: FitModel, noise_sampled, target: _Target):
     """Log posterior where the sampler moves, and the way from there to the real line."""
 
     def to_x(y):
         return target.centre + jnp.sum(target.root * y[None], axis=1)
 
-    return lambda y: log_density(model, drawn, target.lane, target.sigma, to_x(y)), to_x
+    return lambda y: log_density(model, noise_sampled, target.lane, target.sigma, to_x(y)), to_x
 
 
-def _warm_up(model: FitModel, drawn, acceptance, target: _Target, y, key):
+def _warm_up(model: FitModel, noise_sampled, acceptance, target: _Target, y, key):
     """Place, step and inverse mass matrix of one chain after its warm-up."""
     blackjax = sampler()
-    density, _ = _density(model, drawn, target)
+    density, _ = _density(model, noise_sampled, target)
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=_DOUBLINGS,
         target_acceptance_rate=acceptance, adaptation_info_fn=lambda *_: None,
@@ -169,10 +173,10 @@ def _warm_up(model: FitModel, drawn, acceptance, target: _Target, y, key):
     return state.position, tuned["step_size"], tuned["inverse_mass_matrix"]
 
 
-def _draw(model: FitModel, drawn, draws: int, target: _Target, warm, key):
+def _draw(model: FitModel, noise_sampled, draws: int, target: _Target, warm, key):
     """Draws of one chain on the real line, (D, Q), whether each diverged, and its last place."""
     blackjax = sampler()
-    density, to_x = _density(model, drawn, target)
+    density, to_x = _density(model, noise_sampled, target)
     y, step_size, inverse_mass = warm
     kernel = blackjax.nuts(density, step_size, inverse_mass, max_num_doublings=_DOUBLINGS)
 
@@ -184,15 +188,15 @@ def _draw(model: FitModel, drawn, draws: int, target: _Target, warm, key):
     return x, lost, state.position
 
 
-def _warm_up_chains(model: FitModel, drawn, acceptance, target: _Target, y, keys):
+def _warm_up_chains(model: FitModel, noise_sampled, acceptance, target: _Target, y, keys):
     """`_warm_up` of all chains of one lane."""
-    one = functools.partial(_warm_up, model, drawn, acceptance, target)
+    one = functools.partial(_warm_up, model, noise_sampled, acceptance, target)
     return jax.vmap(one)(y, keys)
 
 
-def _draw_chains(model: FitModel, drawn, draws, target: _Target, warm, keys):
+def _draw_chains(model: FitModel, noise_sampled, draws, target: _Target, warm, keys):
     """`_draw` of all chains of one lane."""
-    one = functools.partial(_draw, model, drawn, draws, target)
+    one = functools.partial(_draw, model, noise_sampled, draws, target)
     return jax.vmap(one)(warm, keys)
 
 
@@ -229,18 +233,18 @@ def posterior(
     sampler()
     study, base = result.study, mode(result)
     markers = study.lanes.joints is not None
-    drawn = (not study.noise_given[0], markers and not study.noise_given[1])
+    noise_sampled = (not study.noise_given[0], markers and not study.noise_given[1])
     good = np.array([k for k in range(result.lanes) if succeeded(result, k)], int)
     found = _empty(result, chains, draws)
     batch = batch_size(max(len(good), 1), batch)
     for first in range(0, len(good), batch):
         of = good[first : first + batch]
-        start = {int(k): around_the_fit(base, int(k), drawn, chains, seed) for k in of}
+        start = {int(k): around_the_fit(base, int(k), noise_sampled, chains, seed) for k in of}
         for again, times in enumerate((1, *_AGAIN)):
             if not start:
                 break
-            x, lost = _run(base, drawn, draws, times, start, batch, (seed, again))
-            start = _keep(found, base, drawn, start, x, lost)
+            x, lost = _run(base, noise_sampled, draws, times, start, batch, (seed, again))
+            start = _keep(found, base, noise_sampled, start, x, lost)
         if progress is not None:
             progress(len(of), len(good))
     return found
@@ -257,7 +261,15 @@ def _empty(result: FitResult, chains: int, draws: int) -> Posterior:
     )  # fmt: skip
 
 
-def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start], batch: int, salt):
+def _run(
+    base: FitResult,
+    noise_sampled,
+    draws: int,
+    times: int,
+    start: dict[int, Start],
+    batch: int,
+    salt,
+):
     """Warm up and draw `times` times: (lanes, C, times D, Q) on the real line, and what diverged.
 
     The lanes are filled up to `batch`, so that one program serves all rounds.
@@ -269,8 +281,8 @@ def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start]
     places = map(np.stack, zip(*(start[int(k)] for k in of), strict=True))
     centre, root, y = places
     model = base.study.model
-    warm_up = program(_warm_up_chains, model, drawn, axes=(None, 0, 0, 0))
-    draw = program(_draw_chains, model, drawn, draws)
+    warm_up = program(_warm_up_chains, model, noise_sampled, axes=(None, 0, 0, 0))
+    draw = program(_draw_chains, model, noise_sampled, draws)
 
     def keys(turn: int):
         key = jax.random.fold_in(jax.random.key(seed), again * 1000 + turn)
@@ -287,7 +299,7 @@ def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start]
     return tuple(whole)
 
 
-def _keep(found: Posterior, base: FitResult, drawn, start, x, lost) -> dict[int, Start]:
+def _keep(found: Posterior, base: FitResult, noise_sampled, start, x, lost) -> dict[int, Start]:
     """Put the draws of some lanes in their places; returns where those not good go on."""
     lanes, P = base.study.lanes, base.study.size
     more = {}
@@ -296,7 +308,7 @@ def _keep(found: Posterior, base: FitResult, drawn, start, x, lost) -> dict[int,
         theta = low + (high - low) / (1 + np.exp(-own[..., :P]))
         theta = np.where(lanes.active[lane] > 0, theta, np.nan)
         noise = np.zeros((*own.shape[:-1], 2))
-        noise[..., np.flatnonzero(drawn)] = own[..., P:]
+        noise[..., np.flatnonzero(noise_sampled)] = own[..., P:]
         times = own.shape[1] // found.theta.shape[2]
         found.theta[lane] = theta[:, times - 1 :: times]
         found.sigma[lane] = base.sigma[lane] * np.exp(noise[:, times - 1 :: times])

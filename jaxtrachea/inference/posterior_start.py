@@ -65,7 +65,7 @@ def mode(result: FitResult) -> FitResult:
 
 
 def around_the_fit(
-    result: FitResult, lane: int, drawn: tuple[bool, bool], chains: int, seed: int
+    result: FitResult, lane: int, noise_sampled: tuple[bool, bool], chains: int, seed: int
 ) -> Start:
     """The estimate and its covariance on the real line; chains scattered by one of it.
 
@@ -85,7 +85,7 @@ def around_the_fit(
     known = np.isfinite(correlation) & finite[:, None] & finite
     correlation = np.where(known, (1 - _SHRINK) * np.clip(correlation, -1, 1), 0)
     np.fill_diagonal(correlation, 1)
-    Q = P + sum(drawn)
+    Q = P + sum(noise_sampled)
     covariance = np.eye(Q) / max(2 * result.samples[lane], 1)
     covariance[:P, :P] = correlation * np.outer(deviation, deviation)
     centre = np.append(np.where(active, to_line(share, 0, 1), 0), np.zeros(Q - P))

@@ -12,8 +12,8 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.cross_validation import refitted
+from jaxtrachea.inference.holdout_groups import companions
 from jaxtrachea.inference.residuals import rms
-from jaxtrachea.inference.together import companions
 from jaxtrachea.measurements.read import Curve
 
 
@@ -83,7 +83,7 @@ def repeats(study: Study) -> Repeats:
     own = any(p.scope == "trial" and p.name not in OF_THE_PRESS for p in free)
     shared = all(p.scope == "shared" or p.name in OF_THE_PRESS for p in free)
     for lane, curves in enumerate(() if own else study.curves):
-        for kind, groups in _groups(curves, study.together, shared=shared):
+        for kind, groups in _groups(curves, study.holdout_groups, shared=shared):
             for group in groups:
                 row = np.zeros(width, bool)
                 row[group] = True
@@ -96,10 +96,10 @@ def repeats(study: Study) -> Repeats:
 
 
 def _groups(
-    curves: tuple[Curve, ...], together: Sequence[Sequence[str]], *, shared: bool
+    curves: tuple[Curve, ...], holdout_groups: Sequence[Sequence[str]], *, shared: bool
 ) -> list[tuple[str, list[list[int]]]]:
     """For each specimen of a lane, what is left out and the trials of each."""
-    twins = companions(curves, together)
+    twins = companions(curves, holdout_groups)
     specimens: dict[str, list[int]] = {}
     for t, curve in enumerate(curves):
         specimens.setdefault(curve.specimen, []).append(t)

@@ -49,14 +49,16 @@ def _layouts(names: tuple[str, ...]) -> tuple[_Layout, ...]:
         own = {q.name: [r for r in of_ring if {*q.columns(r)} & {*names}] for q in quantities}
         for q in quantities:
             for ring in own[q.name]:
-                if q.beside is not None and ring not in own[q.beside]:
-                    (other,) = next(o for o in quantities if o.name == q.beside).columns(ring)
+                if q.requires is not None and ring not in own[q.requires]:
+                    (other,) = next(o for o in quantities if o.name == q.requires).columns(ring)
                     raise Fault(
                         "column_missing",
                         f"there is a column for {q.columns(ring)[0]} and none for {other}",
                         "add it, along the inward normal; empty where it was not seen",
                     )
-        rings = tuple(dict.fromkeys(r for q in quantities if q.beside is None for r in own[q.name]))
+        rings = tuple(
+            dict.fromkeys(r for q in quantities if q.requires is None for r in own[q.name])
+        )
         if rings:
             found.append(_Layout(field, rings, tuple(q for q in quantities if own[q.name])))
     return tuple(found)

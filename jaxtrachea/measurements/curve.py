@@ -145,7 +145,7 @@ class RawCurve:
     """A curve as a reader found it: units converted (mm, N, rad), nothing else checked or changed.
 
     `rows` numbers the samples for messages: lines of a text file, or samples counted from 1.
-    `unread` are the columns of a tidy table that have no role. `notes` say how it was read.
+    `unused_columns` are the columns of a tidy table that have no role. `notes` say how it was read.
     """
 
     specimen: str
@@ -167,7 +167,7 @@ class RawCurve:
     end_rings: np.ndarray | None = None
     end_U: np.ndarray | None = None
     end_V: np.ndarray | None = None
-    unread: tuple[str, ...] = ()
+    unused_columns: tuple[str, ...] = ()
     conditions: tuple[tuple[str, float], ...] = ()
     notes: tuple[str, ...] = ()
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtrachea.measurements.curve import Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.plausible import doubt, drawn
+from jaxtrachea.measurements.plausible import implausible_size, retracting
 from jaxtrachea.measurements.record_faults import Faults, faults
 from jaxtrachea.measurements.segments import JITTER, NoLoading, Segments, segment
 from jaxtrachea.measurements.usage import CHOOSING, Usage, lasting, usage
@@ -25,7 +25,7 @@ def usage_of(
     unit = "samples" if raw.time is None else "s"
     seen = usage(displacement, keep, found, options.loading, unit, faulty)
     taken = displacement[keep], force[keep]
-    doubts = [said for said in (doubt(*taken), drawn(*taken)) if said is not None]
+    doubts = [said for said in (implausible_size(*taken), retracting(*taken)) if said is not None]
     if found is not None and raw.time is not None and options.loading in (*CHOOSING, "record"):
         whole = options.loading == "record"
         doubts += remarks_of(raw.time, displacement, found, whole=whole)

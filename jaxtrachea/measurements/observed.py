@@ -24,7 +24,7 @@ class Quantity:
         side: end of the role of a ring's column, ``"_side"`` of ``"joint_7_side"``.
         end: end of a ring that it is of, ``"U"`` of ``"end_U_7_y"``.
         components: of one value; of a column each.
-        beside: field that has to be given with it.
+        requires: field that has to be given with it.
         gaps: NaN stands for not observed; otherwise every sample needs it.
         turns: `ReadOptions.force_sign` turns it.
         largest: option of `ReadOptions` that bounds its size; None: it is not bounded.
@@ -41,7 +41,7 @@ class Quantity:
     side: str = ""
     end: str = ""
     components: tuple[str, ...] = ()
-    beside: str | None = None
+    requires: str | None = None
     gaps: bool = True
     turns: bool = False
     largest: str | None = None
@@ -84,7 +84,7 @@ OBSERVED = (
     Quantity("joint_displacement", words="motion of markers", **_MARKERS),
     Quantity(
         "joint_side_displacement", words="sideward motion of markers", side="_side",
-        beside="joint_displacement", largest="max_displacement", vector=True, **_MARKERS,
+        requires="joint_displacement", largest="max_displacement", vector=True, **_MARKERS,
     ),
     Quantity("end_U", words="motion of ring ends U", end="U", **_ENDS),
     Quantity("end_V", words="motion of ring ends V", end="V", **_ENDS),

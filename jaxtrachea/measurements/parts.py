@@ -29,7 +29,7 @@ def legs_of(travel: np.ndarray, points: Sequence[int], tolerance: float) -> Iter
         yield Segment(kind, start, stop + (stop == travel.size - 1))
 
 
-def touch(rise: Rise, foot: int, last: int) -> int:
+def contact_index(rise: Rise, foot: int, last: int) -> int:
     """First sample of a loading after which the force stays above a small share of its range."""
     force = rise.force[foot:last]
     low = float(force.min())

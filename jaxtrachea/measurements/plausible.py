@@ -12,7 +12,7 @@ LENGTHS = {"um": 1e-3, "cm": 10.0, "m": 1000.0}
 FORCES = {"mN": 1e-3, "gf": 9.80665e-3, "kN": 1000.0}
 
 
-def doubt(displacement: np.ndarray, force: np.ndarray) -> str | None:
+def implausible_size(displacement: np.ndarray, force: np.ndarray) -> str | None:
     """What is hard to believe about the size of a curve, with the unit it may be in.
 
     A displacement and a force that are both tiny are taken for a cantilever's and left alone.
@@ -24,10 +24,10 @@ def doubt(displacement: np.ndarray, force: np.ndarray) -> str | None:
     Returns:
         One sentence, or None.
     """
-    return doubt_of(float(np.ptp(displacement)), float(np.ptp(force)))
+    return implausible_extent(float(np.ptp(displacement)), float(np.ptp(force)))
 
 
-def drawn(displacement: np.ndarray, force: np.ndarray) -> str | None:
+def retracting(displacement: np.ndarray, force: np.ndarray) -> str | None:
     """What a record says in which a tool draws from the beginning; one sentence, or None.
 
     A press whose file counts both the other way looks the same, and where first touch and the zero
@@ -44,8 +44,8 @@ def drawn(displacement: np.ndarray, force: np.ndarray) -> str | None:
     )
 
 
-def doubt_of(extent: float, peak: float) -> str | None:
-    """As `doubt`, of the range of the displacement (mm) and of the force (N)."""
+def implausible_extent(extent: float, peak: float) -> str | None:
+    """As `implausible_size`, of the range of the displacement (mm) and of the force (N)."""
     if _within(extent, peak) or (extent < DISPLACEMENT[0] and peak < FORCE[0]):
         return None
     units = [f"force in {u} ({peak * f:.3g} N)" for u, f in FORCES.items()

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from jaxtrachea.measurements.batch_checks import finish_all
 from jaxtrachea.measurements.curve import (
     BadCurve,
     Curve,
@@ -28,7 +29,6 @@ from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.table import Text
 from jaxtrachea.measurements.readers.text_file import first_bytes, read_bytes, to_utf8
 from jaxtrachea.measurements.readers.workbook import listed, read_sheets
-from jaxtrachea.measurements.together import finish_all
 
 __all__ = [
     "BadCurve",
@@ -156,7 +156,7 @@ def write_hdf5(
 def _notes(records: Records) -> list[str]:
     """How tables were read, and which columns were not, without the file: said once of many."""
     said = [*dict.fromkeys(n for r in records if isinstance(r, RawCurve) for n in r.notes)]
-    names = dict.fromkeys(n for r in records if isinstance(r, RawCurve) for n in r.unread)
+    names = dict.fromkeys(n for r in records if isinstance(r, RawCurve) for n in r.unused_columns)
     if not names:
         return said
     shown = ", ".join(repr(name) for name in [*names][:_COLUMNS])

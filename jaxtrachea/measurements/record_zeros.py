@@ -339,13 +339,13 @@ def _by_fits(records: _Records) -> _Taken:
     hint = press_shape.fall(*records, bare, _columns((*_SHAPE, "onset", "force_offset")))
     rows = np.flatnonzero((hint > _HINT) | (rss > _HINT + 2 * n))
     if len(rows):
-        found = _told_apart(records.take(rows), bare[rows], rss[rows])
+        found = _separable(records.take(rows), bare[rows], rss[rows])
         for whole, part in zip(out, found, strict=True):
             whole[rows] = part
     return out
 
 
-def _told_apart(records: _Records, bare, rss) -> _Taken:
+def _separable(records: _Records, bare, rss) -> _Taken:
     """An onset, an offset or both, where they bring enough beside the best press without."""
     x, y, weight = records
     count, n = x.shape

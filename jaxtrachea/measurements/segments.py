@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from jaxtrachea.measurements.holds import BAND, FEWEST, Hold, Rise, holds, may_hold
-from jaxtrachea.measurements.parts import Segment, legs_of, parts_of, touch
+from jaxtrachea.measurements.parts import Segment, contact_index, legs_of, parts_of
 from jaxtrachea.measurements.turning import loadings, noise, turned_back, turning_points
 
 #: A reversal of less than this share of the loading is jitter of the machine, noise or not.
@@ -274,7 +274,7 @@ def _held(whole: Segments, rise: Rise, legs: Sequence[Segment], start: int) -> S
         foot=places[1],
         stop=places[2],
         keep=kept,
-        parts=tuple(parts_of(legs, places, touch(rise, rest, last) + start)),
+        parts=tuple(parts_of(legs, places, contact_index(rise, rest, last) + start)),
         hold=None if top is None else _shifted(top, start),
         steps=tuple(_shifted(hold, start) for hold in steps),
         stepwise=stepwise and len(steps) > 0,

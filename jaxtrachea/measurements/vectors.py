@@ -34,10 +34,10 @@ def check_vector_shapes(raw: RawCurve) -> None:
         values = getattr(raw, q.name)
         if values is None or not q.gaps:
             continue
-        if q.beside is not None and getattr(raw, q.beside) is None:
+        if q.requires is not None and getattr(raw, q.requires) is None:
             raise Fault(
                 "shape",
-                f"{q.name} needs {q.beside}",
+                f"{q.name} needs {q.requires}",
                 "store it, NaN where it was not seen",
             )
         rings = None if q.rings is None else getattr(raw, q.rings)
@@ -61,7 +61,7 @@ def _check_rings(raw: RawCurve, field: str, given: Sequence[Quantity]) -> None:
     if rings is None:
         return
     if not given:
-        every = " and ".join(q.name for q in RINGS[field] if q.beside is None)
+        every = " and ".join(q.name for q in RINGS[field] if q.requires is None)
         raise Fault("shape", f"{number} without {every}", "store it, or remove the numbers")
     if rings.ndim != 1 or (rings.size and (rings.min() < 0 or np.unique(rings).size != rings.size)):
         raise Fault(

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from jaxtrachea._arguments import ArrayLike, check_fits, real, shaped
 from jaxtrachea._packed import Packing
 from jaxtrachea.fusion import fuse
-from jaxtrachea.mechanics.admission import check_alike, check_shapes
 from jaxtrachea.mechanics.press import Options, Press, check_line, press
+from jaxtrachea.mechanics.validation import check_alike, check_shapes
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 

@@ -107,7 +107,7 @@ def gradient(
     F, zero = solved.force, jnp.zeros_like(solved.inward)
 
     def touched(inward):
-        return press.touch(inward, zero, options)
+        return press.indentation(inward, zero, options)
 
     moved, rising = jax.jvp(touched, (solved.inward,), (jnp.ones_like(zero),))
     normal = jnp.sum(local_frame(solved.phi)[0] * F)

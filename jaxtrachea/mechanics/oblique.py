@@ -16,18 +16,18 @@ from jaxtrachea._arguments import ArrayLike, check_record, check_word, last_axis
 from jaxtrachea._numerics import product, product_of_rows, turned
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
-from jaxtrachea.mechanics.admission import (
-    Validated,
-    admit,
-    check_place,
-    float_type,
-    hide,
-    status_of,
-)
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb, Slide
-from jaxtrachea.mechanics.press import Options, check_line, local_law, read_values, touch
+from jaxtrachea.mechanics.press import Options, check_line, indentation, local_law, read_values
 from jaxtrachea.mechanics.skeleton import Rings, Skeleton, local_frame
+from jaxtrachea.mechanics.validation import (
+    Validated,
+    check_place,
+    float_type,
+    mask,
+    status_of,
+    validate,
+)
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -185,7 +185,7 @@ def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options)
     if options.contact == "bonded":
         moved = given - place.onset * jnp.broadcast_to(normal, given.shape)
     else:
-        share = touch(inward, place.onset, options) / jnp.where(inward > 0, inward, 1)
+        share = indentation(inward, place.onset, options) / jnp.where(inward > 0, inward, 1)
         moved = given * share[..., None]
     moved = jnp.where(known, moved, displacement)
     solve = {
@@ -201,7 +201,7 @@ def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options)
         force, depth = (jnp.where(pulls[..., None], jnp.nan, v) for v in (force, depth))
         status = jnp.where(pulls, PressStatus.PULLS, status)
     refused = place.asked.refused
-    unit, force, depth = hide(refused, place.unit, force, depth)
+    unit, force, depth = mask(refused, place.unit, force, depth)
     return _assemble(unit, force, depth, status_of(refused, status))
 
 
@@ -294,7 +294,7 @@ def _rubbed(place: Place, displacement: Float[Array, "n 3"], friction: Coulomb, 
     frame, onset = local_frame(place.phi_c), place.onset
     D = product(displacement, frame.T)
     inward = D[:, :1]
-    inward = jnp.where(inward < onset, inward - onset, touch(inward, onset, options.press))
+    inward = jnp.where(inward < onset, inward - onset, indentation(inward, onset, options.press))
     D = jnp.concatenate([inward, D[:, 1:]], axis=1)
     return D, turned(place.unit.compliance, frame.T), friction, refused
 
@@ -302,7 +302,7 @@ def _rubbed(place: Place, displacement: Float[Array, "n 3"], friction: Coulomb, 
 def _path_of(place: Place, slid: Slide, refused) -> ObliquePath:
     """Steps in the frame of the tube."""
     frame = local_frame(place.phi_c)
-    unit, slid = hide(refused, place.unit, slid)
+    unit, slid = mask(refused, place.unit, slid)
     status = status_of(refused, slid.status)
     press = _assemble(unit, product(slid.force, frame), product(slid.depth, frame), status)
     sliding = slid.sliding & (refused == PressStatus.OK)
@@ -323,7 +323,7 @@ def place_at(
     s_c, phi_c, onset = _checked(geometry, material, s_c, phi_c, options, onset)
     rings, levels = options.rings, {"axial": options.axial, "shear": options.press.shear}
     used = (*read_values(options.press), *skeleton.read_values(rings, **levels))
-    asked = admit(geometry, material, s_c, dict.fromkeys(used))
+    asked = validate(geometry, material, s_c, dict.fromkeys(used))
     unit = skeleton.respond(geometry, asked.material, asked.s_c, phi_c, rings=rings, **levels)
     law = local_law(geometry, asked.material, asked.s_c, options.press)
     return Place(asked=asked, unit=unit, law=law, phi_c=phi_c, onset=onset)

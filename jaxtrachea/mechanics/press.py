@@ -11,16 +11,16 @@ from jaxtrachea._arguments import ArrayLike, real, shaped
 from jaxtrachea._numerics import centred_hinge, positive_part, scaled
 from jaxtrachea.mechanics import beam as _beam
 from jaxtrachea.mechanics import equilibrium, force_law, punch
-from jaxtrachea.mechanics.admission import (
-    admit,
+from jaxtrachea.mechanics.levels.options import Options, check_line
+from jaxtrachea.mechanics.softening import Softening
+from jaxtrachea.mechanics.validation import (
     check_place,
     check_shapes,
     float_type,
-    hide,
+    mask,
     status_of,
+    validate,
 )
-from jaxtrachea.mechanics.levels.options import Options, check_line
-from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -113,7 +113,7 @@ def softening_of(material: Material, options: Options) -> Softening | None:
     return Softening(**values)
 
 
-def touch(
+def indentation(
     displacement: Float[Array, "*n"],
     onset: Float[Array, ""],
     options: Options,
@@ -190,8 +190,8 @@ class Contact(NamedTuple):
     Attributes:
         law: of the local indentation.
         onset: displacement at first touch, mm.
-        blend: rounded corner of a curve whose onset was fitted, mm, see `touch`; None: that of the
-            options.
+        blend: rounded corner of a curve whose onset was fitted, mm, see `indentation`; None: that
+            of the options.
         softening: of the skeleton; None where it is linear.
     """
 
@@ -213,7 +213,7 @@ def respond(
     stiff skeleton reaches before the fold. (A total coupling ends at the law's own fold before it.)
     """
     law, softening = contact.law, contact.softening
-    moved = touch(displacement, contact.onset, options, contact.blend)
+    moved = indentation(displacement, contact.onset, options, contact.blend)
     if options.coupling == "total":
         return equilibrium.press_total(moved, compliance, law)
     if softening is not None:  # which ends at the law's own fold, too
@@ -254,7 +254,7 @@ def press(
         options: what is modelled (static).
         onset: tool displacement at first touch, mm; 0 if None.
         blend: mm, a scalar: the rounded corner of a curve whose onset was fitted, in the place of
-            `options.onset_width`, see `touch`.
+            `options.onset_width`, see `indentation`.
 
     Returns:
         The `Press`; rows without a stable solution are NaN with a status, others are untouched.
@@ -293,14 +293,14 @@ def _press(
     blend: Float[Array, ""] | None = None,
 ) -> Press:
     """`press`, of arguments that are checked."""
-    material, s_c, refused = admit(
+    material, s_c, refused = validate(
         geometry, material, s_c, read_values(options), reach=options.half_width
     )
     unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
     law = local_law(geometry, material, s_c, options)
     contact = Contact(law, onset, blend, softening_of(material, options))
     solved = respond(displacement, unit.w_C, contact, options)
-    unit, solved = hide(refused, unit, solved)
+    unit, solved = mask(refused, unit, solved)
 
     def per_ring(factor, v):
         return scaled(factor[..., None], jnp.broadcast_to(v, (*displacement.shape, *v.shape)))

@@ -8,13 +8,6 @@ import jax.numpy as jnp
 from jaxtrachea._arguments import real, shaped
 from jaxtrachea._numerics import scaled
 from jaxtrachea.mechanics import press as _press
-from jaxtrachea.mechanics.admission import (
-    admit,
-    check_place,
-    float_type,
-    hide,
-    status_of,
-)
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.levels.level import Motion
@@ -23,6 +16,13 @@ from jaxtrachea.mechanics.press import Press
 from jaxtrachea.mechanics.relaxation_parts import relax_parts, way_of
 from jaxtrachea.mechanics.samples import as_before, in_order, no_history
 from jaxtrachea.mechanics.softening import Softening
+from jaxtrachea.mechanics.validation import (
+    check_place,
+    float_type,
+    mask,
+    status_of,
+    validate,
+)
 from jaxtrachea.relaxation.filter import Relaxation, relax
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -104,7 +104,7 @@ def _press_in_time(
     options: Options,
 ) -> Press:
     """`press_in_time`, of arguments that are checked."""
-    material, s_c, refused = admit(
+    material, s_c, refused = validate(
         geometry, material, motion.s_c, _press.read_values(options), reach=options.half_width
     )
     beam = _press.ligament_beam(geometry, material, options)
@@ -116,7 +116,7 @@ def _press_in_time(
     assert motion.time is not None
     contact = _press.Contact(law, onset, blend, softening)
     elastic = _press.respond(displacement, unit.w_C, contact, options)
-    moved = _press.touch(displacement, onset, options, blend)
+    moved = _press.indentation(displacement, onset, options, blend)
     time, order = in_order(motion.time, displacement)
     relaxation, refused = _validated(relaxation, refused)
     skipped = order != PressStatus.OK
@@ -127,7 +127,7 @@ def _press_in_time(
         apart = relaxation.skeleton is not None
         way = way_of(solved.load, unit.w_C, law) if apart else moved
         solved, status = _softened(solved, status, softening, way)
-    unit, solved = hide(refused, unit, solved)
+    unit, solved = mask(refused, unit, solved)
     load = solved.load
 
     def per_ring(factor, v):

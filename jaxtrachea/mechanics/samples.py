@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea.mechanics.admission import has_solution
+from jaxtrachea.mechanics.validation import has_solution
 from jaxtrachea.status import PressStatus
 
 

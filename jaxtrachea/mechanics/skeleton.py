@@ -18,7 +18,7 @@ from jaxtrachea.mechanics import axial as _axial
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics import spatial_beam
 from jaxtrachea.mechanics._matrix2 import mul
-from jaxtrachea.mechanics.admission import admit, check_place, float_type, hide, status_of
+from jaxtrachea.mechanics.validation import check_place, float_type, mask, status_of, validate
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -106,13 +106,13 @@ def _response(
     shear: bool,
 ) -> Skeleton:
     """`skeleton_response`, of arguments that are checked."""
-    asked = admit(geometry, material, s_c, read_values(rings, axial=axial, shear=shear))
+    asked = validate(geometry, material, s_c, read_values(rings, axial=axial, shear=shear))
     levels = {"rings": rings, "axial": axial, "shear": shear}
     unit = respond(geometry, asked.material, asked.s_c, phi_c, **levels)
     off_tube = asked.refused == PressStatus.OFF_TUBE
     own = jnp.where(off_tube, RingStatus.OFF_TUBE, RingStatus.BAD_MATERIAL)
     status = status_of(asked.refused, unit.status, own)
-    return hide(asked.refused, unit)._replace(status=status)
+    return mask(asked.refused, unit)._replace(status=status)
 
 
 def read_values(rings: Rings, *, axial: bool, shear: bool) -> tuple[str, ...]:

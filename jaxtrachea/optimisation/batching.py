@@ -4,7 +4,7 @@ A lane, or a start of one, takes some bytes while it is computed (`Study.bytes_p
 go as many as the memory nearest to the processor holds: on a CPU `CACHED` bytes, since more are out
 of the cache before they are read again (docs/evidence/measured.md), and never fewer than `LONG` of
 the longest curves; on another device what a part of its free memory holds. Either way at most
-`most_slots`. Paths of a level that iterates go one by one on a CPU, and `PATHS` together elsewhere.
+`max_slots`. Paths of a level that iterates go one by one on a CPU, and `PATHS` together elsewhere.
 
 There are few sizes, since each is a program. Of fewer lanes than the memory holds a CPU takes the
 largest size that they fill, and `FEWEST` of even fewer: less than half of what is computed is then
@@ -37,17 +37,17 @@ def on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def most_slots() -> int:
+def max_slots() -> int:
     """Lanes worth computing together at most on the device that JAX names first."""
     return MOST_SLOTS if on_cpu() else MOST_ELSEWHERE
 
 
-def most_in_cache(bytes_per_lane: int) -> int:
+def max_in_cache(bytes_per_lane: int) -> int:
     """Lanes worth computing together at most on a CPU, a power of two."""
     return 1 << (max(LONG, CACHED // bytes_per_lane).bit_length() - 1)
 
 
-def most_in_memory(bytes_per_lane: int, free: float) -> int:
+def max_in_memory(bytes_per_lane: int, free: float) -> int:
     """Lanes that a part of the free memory holds, a power of two and at least 1.
 
     Args:
@@ -80,6 +80,6 @@ def worth_optimising(total: int, bytes_per_lane: int) -> bool:
     return together > UNOPTIMISED_LANES or together * bytes_per_lane > UNOPTIMISED_BYTES
 
 
-def copied_together(bytes_per_lane: int) -> int:
+def copied_at_once(bytes_per_lane: int) -> int:
     """Lanes that are copied for the solver at a time."""
     return max(LONG, COPIED // bytes_per_lane)

@@ -29,7 +29,7 @@ from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.inference.together import companions
+from jaxtrachea.inference.holdout_groups import companions
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.prediction.pressed import Pressed, pressed
 
@@ -209,7 +209,7 @@ def _of_lane(stored: FitResult, lane: int, curves: tuple[Curve, ...], left: _Lef
     """Every position of a lane left out in turn."""
     fitted = pressed(stored)
     places: dict[object, list[int]] = {}
-    for curve, group in zip(curves, companions(curves, stored.study.together), strict=True):
+    for curve, group in zip(curves, companions(curves, stored.study.holdout_groups), strict=True):
         s = np.nan if curve.s_c is None else round(curve.s_c / SAME_PLACE)
         places.setdefault((curve.specimen, s, curve.phi_c, *curve.direction), []).extend(group)
     at = np.array([c.s_c for c in curves if c.s_c is not None], float)

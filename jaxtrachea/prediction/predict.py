@@ -21,7 +21,7 @@ from jaxtyping import ArrayLike
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.parameters import DECLARED
-from jaxtrachea.fitting.refusals import depths, untested
+from jaxtrachea.fitting.refusals import depths, unvalidated
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.mechanics.levels.level import Motion
@@ -307,7 +307,7 @@ def _on_host(
         depth = depths(displacement, onset_of(stored, source), model.options)
         beyond = _beyond(spans, float(s), depth, aside, counted)
         deepest = float(np.max(np.abs(depth)))
-        deep = untested(model.options, float(model.geometry.radius), deepest, counted)
+        deep = unvalidated(model.options, float(model.geometry.radius), deepest, counted)
         foreign = [p.name for p in stored.study.parameters if p.foreign]
         if foreign and deepest <= fitted.reached(source.lane, float(s), phi, direction) + 1e-9:
             foreign = []  # the fit has seen such a press
@@ -470,7 +470,7 @@ def predict(
     if D.ndim != 1 or not D.size or not np.isfinite(D).all():
         raise ValueError("displacement: expected a finite number or a vector of them, mm")
     check_position(results, s)
-    check_aside(results, phi, direction)
+    check_off_midline(results, phi, direction)
     check_timed(results, time is not None, "time")
     times = None if time is None else [_times(time, D)]
     if specimen is None:
@@ -533,7 +533,7 @@ def check_timed(results: FitResult, given: bool, what: str) -> None:
         raise ValueError(f"this fit is elastic, its force knows no time; leave {what} out")
 
 
-def check_aside(results: FitResult, phi: float, direction: tuple[float, float]) -> None:
+def check_off_midline(results: FitResult, phi: float, direction: tuple[float, float]) -> None:
     """Refuse a press that the model does not have.
 
     Raises:
@@ -553,7 +553,7 @@ def check_aside(results: FitResult, phi: float, direction: tuple[float, float]) 
             f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is not on the cartilage; expected "
             f"within {alpha:.4g} rad ({np.degrees(alpha):.4g} deg)"
         )
-    if not abs(phi) <= (most := model.level.tested_angle(alpha)):
+    if not abs(phi) <= (most := model.level.validated_angle(alpha)):
         raise ValueError(
             f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is too near to the ends of the rings, "
             f"where the model is too stiff; expected within {most:.4g} rad "

@@ -34,7 +34,7 @@ def overview(findings: AnalysisResults) -> Iterator[Table | str]:
         yield from analysis.terminal(found, lanes)
     yield tables.quality_table(result, lanes)
     for analysis, found in findings.found:
-        if analysis.place not in ("estimates", "quality"):
+        if analysis.report_section not in ("estimates", "quality"):
             yield from analysis.terminal(found, lanes)
     for lane in lanes if result.study.free and not cut else ():
         yield f"{lane_label(result, lane)}: {verdict_sentence(result, lane, profiles)}"

@@ -9,9 +9,9 @@ from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.result import (
     DETERMINED,
     FitResult,
+    already_reported,
     assess,
     is_own,
-    said_before,
     unknown_label,
 )
 from jaxtrachea.inference.labels import lane_label, peak_force, succeeded
@@ -47,7 +47,7 @@ def estimate_table(
     rows = []
     for lane in lanes:
         for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
-            if said_before(result, lanes, lane, i):
+            if already_reported(result, lanes, lane, i):
                 continue
             assessed = assess(result, lane, i, profiles)
             rows.append(
@@ -74,7 +74,7 @@ def spread_table(result: FitResult, profiles: Profiles | None = None) -> Table:
     good = [k for k in range(result.lanes) if succeeded(result, k)]
     for lane in good:
         for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
-            if said_before(result, good, lane, i):
+            if already_reported(result, good, lane, i):
                 continue
             assessed = assess(result, lane, i, profiles)
             press = p.name in OF_THE_PRESS and p.scale == "linear"
@@ -85,12 +85,15 @@ def spread_table(result: FitResult, profiles: Profiles | None = None) -> Table:
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
     for name, entries in columns.items():
-        told = np.array([e[:2] for e in entries if e[2] in DETERMINED]).reshape(-1, 2)
-        row: dict[str, object] = {"parameter": name, "determined": f"{len(told)} of {len(entries)}"}
+        determined = np.array([e[:2] for e in entries if e[2] in DETERMINED]).reshape(-1, 2)
+        row: dict[str, object] = {
+            "parameter": name,
+            "determined": f"{len(determined)} of {len(entries)}",
+        }
         row["identifiable"] = float(np.mean([e[2] == "identifiable" for e in entries]))
-        if len(told):
-            low, mid, high = map(float, np.quantile(told[:, 0], [0.25, 0.5, 0.75]))
-            middle, unit = float(np.median(told[:, 1])), units.get(name)
+        if len(determined):
+            low, mid, high = map(float, np.quantile(determined[:, 0], [0.25, 0.5, 0.75]))
+            middle, unit = float(np.median(determined[:, 1])), units.get(name)
             row |= {"median": mid, "quartiles": (low, high)}
             row["error"] = f"{middle:.2g} {unit}" if unit else f"{100 * middle:.2g} %"
         rows.append(row)

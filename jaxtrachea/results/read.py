@@ -201,7 +201,7 @@ def _study(file: Any, model: dict[str, Any], place: _Places, curves: tuple[Curve
         noise_given=(bool(model["noise_given"][0]), bool(model["noise_given"][1])),
         marker_noise=_pair(model["marker_noise"]),
         joint=bool(model["joint"]),
-        together=tuple(map(tuple, model["together"])),
+        holdout_groups=tuple(map(tuple, model["together"])),
         balance=model["balance"],
         force_share=model["force_share"],
         shares=shares,

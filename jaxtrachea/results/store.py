@@ -57,7 +57,7 @@ def write(
             "balance": study.balance,
             "marker_noise": study.marker_noise,
             "joint": study.joint,
-            "together": study.together,
+            "together": study.holdout_groups,
             "force_share": study.force_share,
             "reading": dict(reading),
             "units": {"length": "mm", "force": "N", "angle": "rad"},

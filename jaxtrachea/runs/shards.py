@@ -20,7 +20,7 @@ from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fitting import lane
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.batching import most_in_memory, most_slots
+from jaxtrachea.optimisation.batching import max_in_memory, max_slots
 from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.runs import manifest as manifests
 from jaxtrachea.runs.manifest import Manifest
@@ -58,8 +58,8 @@ def slots(study: Study, free: float) -> int:
         study: the study.
         free: memory of the device that is free, bytes.
     """
-    fitting = most_in_memory(study.bytes_per_lane, free)
-    return min(most_slots(), study.most_together, fitting)
+    fitting = max_in_memory(study.bytes_per_lane, free)
+    return min(max_slots(), study.max_batch, fitting)
 
 
 def worker_devices(threads: int | None = None) -> list:

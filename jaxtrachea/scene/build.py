@@ -112,8 +112,8 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
             f"an inner wall) are bridged up to {filled:.2g} mm deep",
             wall_check.measure(mesh, geometry, scene.tube).sentence,
         )
-        if doubt := wall_check.look_beyond(mesh, geometry, scene.tube).sentence:
-            notes += (doubt,)
+        if caveat := wall_check.look_beyond(mesh, geometry, scene.tube).sentence:
+            notes += (caveat,)
     notes += dropped_effects(scene)
     return Staged(scene=scene, material=material, path=path, files=tuple(files), notes=notes)
 
@@ -170,8 +170,8 @@ def dropped_effects(scene: Scene) -> tuple[str, ...]:
     for effect in scene.plan.effects:
         if effect.name == "friction" and scene.friction is not None and not scene.plan.friction:
             notes.append(f"friction: off, {effect.reason}")
-        if effect.doubt:
-            notes.append(f"{effect.name}: {effect.level}, {effect.doubt}")
+        if effect.caveat:
+            notes.append(f"{effect.name}: {effect.level}, {effect.caveat}")
     return tuple(notes)
 
 

@@ -96,14 +96,14 @@ class Verdict(NamedTuple):
         reason: for that.
         refused: levels that this scene cannot have: why, and the cure.
         free: the user's word counts; else the level is as it is.
-        doubt: what makes numbers at that level doubtful, and the cure; a note of the scene.
+        caveat: what makes numbers at that level doubtful, and the cure; a note of the scene.
     """
 
     level: str
     reason: str
     refused: Mapping[str, tuple[str, str]] = {}
     free: bool = True
-    doubt: str = ""
+    caveat: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Effect:
         either: one of those is enough.
         requires: effects without which it cannot be.
         implies: effects that have to be on with it, and so are.
-        holds: effects that do not go alone while it is on.
+        blocks_removal: effects that do not go alone while it is on.
         rungs: levels of its ladder from coarse to fine; empty: it is not traded.
         ladder_kind: whether a truncation is climbed, or a model.
         ladder: its name, empty: that of the effect.
@@ -140,7 +140,7 @@ class Effect:
     either: bool = False
     requires: tuple[str, ...] = ()
     implies: tuple[str, ...] = ()
-    holds: tuple[str, ...] = ()
+    blocks_removal: tuple[str, ...] = ()
     rungs: tuple[str, ...] = ()
     ladder_kind: Literal["truncation", "model"] = "model"
     ladder: str = ""

@@ -12,8 +12,8 @@ from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.fusion import map_sequentially
-from jaxtrachea.mechanics.admission import has_solution
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
+from jaxtrachea.mechanics.validation import has_solution
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
 from jaxtrachea.scene.curve import distance_from, lay

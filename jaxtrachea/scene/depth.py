@@ -36,8 +36,8 @@ def reached(case: Case) -> float:
     """How far the wall is pressed in (bonded: or drawn), over the tube's radius."""
     facts = case.facts
     fixed = case.levels["contact_point"] == "fixed" or not facts.poses
-    drawn, pressed = facts.way_fixed if fixed else facts.way_per_step
-    return max(pressed, -drawn if case.options.contact == "bonded" else 0.0)
+    retracted, pressed = facts.way_fixed if fixed else facts.way_per_step
+    return max(pressed, -retracted if case.options.contact == "bonded" else 0.0)
 
 
 def departure(softness, way):
@@ -46,7 +46,7 @@ def departure(softness, way):
     return way * (e_1 + e_2 * way)
 
 
-def _untested(tested: float, share: float) -> str:
+def _unvalidated(tested: float, share: float) -> str:
     """A doubt where the wall is moved further than the skeleton was tested; else empty."""
     if share <= tested:
         return ""
@@ -94,14 +94,14 @@ def skeleton(case: Case) -> Verdict:
     if not cannot:
         why = f"{far}, and e_1 and e_2 are given"
         return Verdict(
-            "softening", why, refused, doubt=_untested(line.VALIDATED_DEPTH["softening"], share)
+            "softening", why, refused, caveat=_unvalidated(line.VALIDATED_DEPTH["softening"], share)
         )
     if given and case.options.skeleton == "auto":
         raise PlanError("skeleton", "'auto'", f"{far}, and {cannot}", cure)
-    doubt = ""
+    caveat = ""
     if share > line.VALIDATED_DEPTH["linear"]:
-        doubt = f"but {far}: {_TOO_STIFF}; {_MIDLINE}"
-    return Verdict("linear", f"{far}; {cannot}", refused, doubt=doubt)
+        caveat = f"but {far}: {_TOO_STIFF}; {_MIDLINE}"
+    return Verdict("linear", f"{far}; {cannot}", refused, caveat=caveat)
 
 
 def _sections(case: Case) -> Verdict:
@@ -130,5 +130,5 @@ def _sections(case: Case) -> Verdict:
         raise PlanError("skeleton", "'sections'", str(error), cure) from None
     why = "the material is that of deforming cross-sections"
     return Verdict(
-        "sections", why, refused, doubt=_untested(sections.VALIDATED_DEPTH, reached(case))
+        "sections", why, refused, caveat=_unvalidated(sections.VALIDATED_DEPTH, reached(case))
     )

@@ -215,7 +215,7 @@ class EffectOptions:
         _contact_point, least="", values={}
     )
     friction: Switch = _effect(
-        _friction, implies=("second_plane",), holds=("second_plane",), rungs=ON_OFF
+        _friction, implies=("second_plane",), blocks_removal=("second_plane",), rungs=ON_OFF
     )
     second_plane: Switch = _effect(_second_plane, rungs=ON_OFF)
     rings: Literal["auto", "mat", "arch", "arch2"] = _effect(

@@ -68,8 +68,11 @@ def facts_of(
 
     radius = float(level_type(material).wall_radius(scene.geometry, scene.radius))
 
-    def reach(way, drawn):
-        least, most = np.fmin.reduce(way[drawn], initial=0), np.fmax.reduce(way[outside], initial=0)
+    def reach(way, retracted):
+        least, most = (
+            np.fmin.reduce(way[retracted], initial=0),
+            np.fmax.reduce(way[outside], initial=0),
+        )
         return float(least) / radius, float(most) / radius
 
     def largest(v, needed):

@@ -27,14 +27,14 @@ OF_JOINTS = ("friction", "rings", "axial", "end_motion", "shear", "two_material"
 class Decision:
     """One decision: its level (`on`, `off` or a word), the reason, and whether it was forced.
 
-    `doubt`: what makes numbers at that level doubtful, and the cure; empty: nothing does.
+    `caveat`: what makes numbers at that level doubtful, and the cure; empty: nothing does.
     """
 
     name: str
     level: str
     reason: str
     forced: bool = False
-    doubt: str = ""
+    caveat: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Plan:
         ignored: effects that stay off (the contact point: that stays) whatever a path needs,
             because the user wished it or a tolerance allows it. A row that needs any other effect
             that is off is refused by status (`ranges.outside_plan`).
-        served: presses that a tolerance was measured for; None: no tolerance.
+        valid_range: presses that a tolerance was measured for; None: no tolerance.
         effects: all decisions in words; they do not count in comparisons.
     """
 
@@ -95,7 +95,7 @@ class Plan:
     ring_ends: bool
     options: Options
     ignored: frozenset[str] = frozenset()
-    served: ValidRange | None = None
+    valid_range: ValidRange | None = None
     effects: tuple[Decision, ...] = dataclasses.field(default=(), compare=False, repr=False)
 
     def __post_init__(self):
@@ -204,7 +204,7 @@ class Plan:
             return None
         if name == "skeleton" and self.level(name) == "sections":  # another material
             return None
-        if any(name in e.holds and self.has(e.name) for e in EFFECTS.values()):
+        if any(name in e.blocks_removal and self.has(e.name) for e in EFFECTS.values()):
             return None
         less = self.at(**{name: EFFECTS[name].least})
         if less == self:

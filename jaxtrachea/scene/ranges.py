@@ -80,8 +80,8 @@ def outside_plan(
         if _frictionless(scene):
             # What slid leaves its trace in later rows.
             found.append(jnp.cumsum(pressing & slides(motion)) > 0)
-    if plan.served is not None:
-        found.append(_beyond(plan.served, presses))
+    if plan.valid_range is not None:
+        found.append(_beyond(plan.valid_range, presses))
     if "skeleton" in less:
         found.append(deep(scene, material, _inward(presses)))
     if set(less) - {"axial", "skeleton"}:
@@ -91,14 +91,14 @@ def outside_plan(
     return pressing & functools.reduce(jnp.logical_or, found) if found else None
 
 
-def _beyond(served: ValidRange, presses: Presses):
+def _beyond(valid_range: ValidRange, presses: Presses):
     """Rows outside of what the tolerance of the plan was measured for."""
     D, phi, s = presses.displacement, presses.phi, presses.s
     c, n = jnp.cos(phi), jnp.sin(phi)
     reach = (
-        (jnp.abs(phi), served.angle), (jnp.abs(D[:, 0]), served.along),
-        (jnp.abs(c * D[:, 2] - n * D[:, 1]), served.across),
-        (_inward(presses), served.inward), (s, served.s[1]), (-s, -served.s[0]),
+        (jnp.abs(phi), valid_range.angle), (jnp.abs(D[:, 0]), valid_range.along),
+        (jnp.abs(c * D[:, 2] - n * D[:, 1]), valid_range.across),
+        (_inward(presses), valid_range.inward), (s, valid_range.s[1]), (-s, -valid_range.s[0]),
     )  # fmt: skip
     beyond = [v > limit + COVERED * (1 + abs(limit)) for v, limit in reach]
     return functools.reduce(jnp.logical_or, beyond)

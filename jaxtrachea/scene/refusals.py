@@ -42,8 +42,8 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
     A row that does not press needs nothing of the plan, the rings and the tube: off the plan or
     behind the ends of the rings it is computed as no motion, on the midline; off the tube at its
     end. Refused rows of a line of joints are computed as no motion, too, and their results hidden
-    (`hide`): by 0 times NaN they would reach the derivatives of other rows by the geometry. With
-    friction they are NaN, since what follows goes on from them; a level may see to it itself.
+    (`mask_rows`): by 0 times NaN they would reach the derivatives of other rows by the geometry.
+    With friction they are NaN, since what follows goes on from them; a level may see to it itself.
     """
     presses = path if made is None else made.presses
     assert presses is not None
@@ -94,7 +94,7 @@ def hidden_rows(
     return functools.reduce(jnp.logical_or, refused.values()) if at_rest(scene) else None
 
 
-def hide(hidden: Bool[Array, "*n"] | None, results: Any) -> Any:
+def mask_rows(hidden: Bool[Array, "*n"] | None, results: Any) -> Any:
     """The results, NaN in the `hidden_rows`; arrays with rows first, of any structure."""
     if hidden is None:
         return results

@@ -40,7 +40,7 @@ from jaxtrachea.scene.anchor import (
 from jaxtrachea.scene.grip import Grip, Slip, pick
 from jaxtrachea.scene.programs import Moved, moved_by
 from jaxtrachea.scene.ranges import half_spacing
-from jaxtrachea.scene.refusals import hide
+from jaxtrachea.scene.refusals import mask_rows
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
@@ -88,7 +88,7 @@ def rub(
         moved = moved_by(path.press, scene.plan)
         slip = product(total.held, frame[1:])[None]
         numbers = moved._replace(slip=slip, dissipated=path.dissipated, status=None)
-        return hide(refused, numbers)._replace(status=moved.status)
+        return mask_rows(refused, numbers)._replace(status=moved.status)
 
     return Grip(
         anchor=anchor,

@@ -61,7 +61,7 @@ def _decided(effect: Effect, case: Case) -> Decision:
     free = requested != "auto" and verdict.free
     level = case.levels[effect.name] = requested if free else verdict.level
     if not free:
-        return Decision(effect.name, level, verdict.reason, doubt=verdict.doubt)
+        return Decision(effect.name, level, verdict.reason, caveat=verdict.caveat)
     if effect.name in case.finest:
         return Decision(effect.name, level, "the finest level")
     return Decision(effect.name, level, "as you wish", forced=True)

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 
 from jaxtrachea.contact.pose import check_rotations, is_rotation
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.mechanics.admission import check_alike
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.validation import check_alike
 from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.held_force import HeldForce, held_force, next_force, no_force
 from jaxtrachea.scene.one_row import OneRow

@@ -19,7 +19,13 @@ from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
 from jaxtrachea.scene.programs import Moved, move
 from jaxtrachea.scene.ranges import contact_share, depth_share
-from jaxtrachea.scene.refusals import hidden_rows, hide, refuse, status_of, without_negative_values
+from jaxtrachea.scene.refusals import (
+    hidden_rows,
+    mask_rows,
+    refuse,
+    status_of,
+    without_negative_values,
+)
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
 from jaxtrachea.status import PressStatus
 
@@ -167,7 +173,7 @@ def pressed(
     way = None if made is None else made._replace(pull=None)
     hidden = hidden_rows(scene, refused)
     press = Pressed(used, moved, way, hidden)
-    moved, moment = hide(hidden, (moved._replace(force=force, status=None), moment))
+    moved, moment = mask_rows(hidden, (moved._replace(force=force, status=None), moment))
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     asked, ends = plan.joints, plan.ring_ends
     return Simulation(
@@ -202,4 +208,4 @@ def surface(
         return None
     presses, moved, made, hidden = press
     lay = deform_sections if scene.plan.surface == "sections" else deform
-    return hide(hidden, lay(scene, presses, moved, path, made))
+    return mask_rows(hidden, lay(scene, presses, moved, path, made))

@@ -44,8 +44,8 @@ def checked_walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     """
     tube = patches_of_wall(geometry, mesh, progress)
     wall_check.check(mesh, geometry, tube)
-    doubtful = wall_check.look_beyond(mesh, geometry, tube).doubtful
-    return dataclasses.replace(tube, doubtful=jnp.asarray(doubtful)) if doubtful.any() else tube
+    uncertain = wall_check.look_beyond(mesh, geometry, tube).uncertain
+    return dataclasses.replace(tube, uncertain=jnp.asarray(uncertain)) if uncertain.any() else tube
 
 
 def patches_of_wall(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:

@@ -149,13 +149,13 @@ class Beyond(NamedTuple):
     """What balls beyond the first and the last ring say of the patches there.
 
     Attributes:
-        doubtful: patches that are further off than the limit somewhere; shape (patches,).
+        uncertain: patches that are further off than the limit somewhere; shape (patches,).
         worst: largest |error| there, mm; 0 without any.
         s: first and last position of the balls of doubtful patches before the rings, and behind
             them, mm; NaN without any.
     """
 
-    doubtful: np.ndarray
+    uncertain: np.ndarray
     worst: float
     s: tuple[tuple[float, float], tuple[float, float]]
 
@@ -175,25 +175,25 @@ class Beyond(NamedTuple):
 def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> Beyond:
     """Gaps of balls beside the wall beyond the first and the last ring. Arguments as `measure`."""
     none = (math.nan, math.nan)
-    doubtful = np.zeros(patches.centres.shape[0], bool)
+    uncertain = np.zeros(patches.centres.shape[0], bool)
     try:
         centres, s, radius = _balls(mesh, geometry, count, beyond=True)
     except MeshError:  # no wall there
-        return Beyond(doubtful, 0.0, (none, none))
+        return Beyond(uncertain, 0.0, (none, none))
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     signed, patch = _sharp_gap(patches, centres)
     error = np.abs(signed - _distance(vertices[faces], centres))
-    doubtful[patch[error > limit_of(geometry)]] = True
-    rows = doubtful[patch]
+    uncertain[patch[error > limit_of(geometry)]] = True
+    rows = uncertain[patch]
     if not rows.any():
-        return Beyond(doubtful, 0.0, (none, none))
+        return Beyond(uncertain, 0.0, (none, none))
     middle = float(np.mean(np.asarray(geometry.ring_positions)))
 
     def span(v):
         return (float(v.min()), float(v.max())) if len(v) else none
 
     ends = span(s[rows & (s < middle)]), span(s[rows & (s > middle)])
-    return Beyond(doubtful, float(error[rows].max()), ends)
+    return Beyond(uncertain, float(error[rows].max()), ends)
 
 
 def _balls(mesh, geometry, count, beyond=False):

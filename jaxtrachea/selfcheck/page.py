@@ -3,7 +3,7 @@
 import math
 import re
 
-from jaxtrachea.selfcheck.judge import Outcome
+from jaxtrachea.selfcheck.assess import Outcome
 from jaxtrachea.selfcheck.table import ROUNDINGS, Case
 
 _HEAD = """# Hard cases

@@ -15,8 +15,8 @@ import numpy as np
 
 from jaxtrachea._compiler import quick_options
 from jaxtrachea._threads import usable_cores
+from jaxtrachea.selfcheck.assess import Outcome, assess, rank
 from jaxtrachea.selfcheck.functions import FUNCTIONS
-from jaxtrachea.selfcheck.judge import Outcome, judge, rank
 from jaxtrachea.selfcheck.table import Case, Truth
 
 
@@ -163,7 +163,7 @@ def _run_case(case: Case, truth: Truth | None, programs: _Programs, untouched) -
     values, status = jax.tree.map(lambda v: v[0], (values, status))
     jacobians = programs.by_columns(columns), programs.by_rows(rows)
     value, status_alone, reverse = programs.by_itself(row)
-    found_in = functools.partial(judge, case, truth, faults)
+    found_in = functools.partial(assess, case, truth, faults)
     found = [found_in(values, status, jacobians), found_in(value, status_alone, (reverse,))]
     value_gaps, gradient_gaps, nans = zip(*found, strict=True)
     return Outcome(

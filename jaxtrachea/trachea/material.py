@@ -21,7 +21,7 @@ Needs = Literal[
     "", "shear", "two-material", "softening", "axial", "arch", "second plane", "sections",
     "arch, sections", "relaxation", "parts",
 ]  # fmt: skip
-Each = Literal["", "span", "ring"]
+VariesBy = Literal["", "span", "ring"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +78,8 @@ class Declaration:
         needs: option or effect that reads it; "" where every press does. A fit has it in its model
             where `mechanics.press.Options` has that option.
         absent: what a value that is not given stands for; "" where it must be given.
-        beside: value without which it means nothing.
-        each: where an array may give each its own value.
+        requires: value without which it means nothing.
+        varies_by: where an array may give each its own value.
         signed: whether it may be zero or negative.
         fit: None where a fit cannot identify it.
     """
@@ -92,8 +92,8 @@ class Declaration:
     symbol: str = ""
     needs: Needs = ""
     absent: str = ""
-    beside: str = ""
-    each: Each = ""
+    requires: str = ""
+    varies_by: VariesBy = ""
     signed: bool = False
     fit: Fitted | None = None
 
@@ -105,7 +105,7 @@ class Declaration:
         """
         check_word(f"{self.name}: part", self.part, Part)
         check_word(f"{self.name}: needs", self.needs, Needs)
-        check_word(f"{self.name}: each", self.each, Each)
+        check_word(f"{self.name}: each", self.varies_by, VariesBy)
 
 
 def _field(declaration: Declaration) -> Any:
@@ -137,20 +137,20 @@ class Material(eqx.Module):
     EI_L: Float[Array, "..."] = _field(
         Declaration(
             "EI_L", "N mm^2", "bending_stiffness", "ligament bending stiffness",
-            symbol="E_L I_L", part="skeleton", each="span", fit=Fitted(10.0, 1e-4, 1e7),
+            symbol="E_L I_L", part="skeleton", varies_by="span", fit=Fitted(10.0, 1e-4, 1e7),
         )
     )  # fmt: skip
     GA_L: Float[Array, "..."] | None = _field(
         Declaration(
             "GA_L", "N", "force", "ligament shear stiffness",
-            symbol="kappa G A", part="skeleton", needs="shear", absent="no shear", each="span",
+            symbol="kappa G A", part="skeleton", needs="shear", absent="no shear", varies_by="span",
             fit=Fitted(10.0, 1e-4, 1e6),
         )
     )  # fmt: skip
     k_M: Float[Array, "..."] = _field(
         Declaration(
             "k_M", "N/mm", "stiffness", "muscle stiffness under a ring",
-            part="skeleton", each="ring", fit=Fitted(0.1, 1e-6, 1e6),
+            part="skeleton", varies_by="ring", fit=Fitted(0.1, 1e-6, 1e6),
         )
     )  # fmt: skip
     k_1: Float[Array, ""] = _field(
@@ -183,14 +183,14 @@ class Material(eqx.Module):
     k_3_ring: Float[Array, ""] | None = _field(
         Declaration(
             "k_3_ring", "N/mm^3", "cubic_stiffness", "cubic contact stiffness on a ring",
-            part="contact", needs="two-material", absent="k_3", beside="k_1_ring", signed=True,
+            part="contact", needs="two-material", absent="k_3", requires="k_1_ring", signed=True,
             fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01, if_named=True),
         )
     )  # fmt: skip
     k_5_ring: Float[Array, ""] | None = _field(
         Declaration(
             "k_5_ring", "N/mm^5", "quintic_stiffness", "quintic contact stiffness on a ring",
-            part="contact", needs="two-material", absent="k_5", beside="k_1_ring", signed=True,
+            part="contact", needs="two-material", absent="k_5", requires="k_1_ring", signed=True,
             fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
         )
     )  # fmt: skip
@@ -211,7 +211,7 @@ class Material(eqx.Module):
     EA_L: Float[Array, "..."] | None = _field(
         Declaration(
             "EA_L", "N", "force", "ligament axial stiffness",
-            symbol="E_L A_L", part="skeleton", needs="axial", absent="no stretch", each="span",
+            symbol="E_L A_L", part="skeleton", needs="axial", absent="no stretch", varies_by="span",
         )
     )  # fmt: skip
     k_A: Float[Array, ""] | None = _field(
@@ -242,13 +242,13 @@ class Material(eqx.Module):
     EI_side: Float[Array, "..."] | None = _field(
         Declaration(
             "EI_side", "N mm^2", "bending_stiffness", "EI_L for bending along the circumference",
-            part="skeleton", needs="second plane", absent="EI_L", each="span",
+            part="skeleton", needs="second plane", absent="EI_L", varies_by="span",
         )
     )  # fmt: skip
     GA_side: Float[Array, "..."] | None = _field(
         Declaration(
             "GA_side", "N", "force", "GA_L for shear along the circumference",
-            part="skeleton", needs="second plane", absent="GA_L", beside="GA_L", each="span",
+            part="skeleton", needs="second plane", absent="GA_L", requires="GA_L", varies_by="span",
         )
     )  # fmt: skip
 
@@ -318,7 +318,7 @@ DEEP = tuple(name for name, p in VALUES.items() if p.needs == "softening")
 def meaningless(given: Iterable[str]) -> dict[str, str]:
     """Values among these that mean nothing without another that is not, and that other."""
     given = set(given)
-    wanting = {name: VALUES[name].beside for name in VALUES if name in given}
+    wanting = {name: VALUES[name].requires for name in VALUES if name in given}
     return {name: other for name, other in wanting.items() if other and other not in given}
 
 

@@ -19,7 +19,7 @@ def area_of(surface: Surface) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
-def together(surfaces: list[Surface]) -> Surface:
+def combined(surfaces: list[Surface]) -> Surface:
     """All triangles in one."""
     shift = np.cumsum([0, *(len(f.vertices) for f in surfaces[:-1])])
     vertices = np.concatenate([f.vertices for f in surfaces])
@@ -44,7 +44,7 @@ def joined(parts: dict[str, Surface]) -> tuple[dict[str, Surface], dict[str, str
     for group in set(of.values()):
         names = [name for name in parts if of[name] == group]
         largest = max(names, key=lambda name: area_of(parts[name]))
-        groups[largest] = together([parts[name] for name in names])
+        groups[largest] = combined([parts[name] for name in names])
         of |= dict.fromkeys(names, largest)
     return groups, of
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxtrachea.trachea.cleaning import Surface
 from jaxtrachea.trachea.mesh import MeshError
-from jaxtrachea.trachea.objects import area_of, together
+from jaxtrachea.trachea.objects import area_of, combined
 from jaxtrachea.units import UnitError, unit_factor
 
 #: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
@@ -52,7 +52,7 @@ def parts_of(path: Path) -> dict[str, Surface]:
             vertices = np.asarray(part.vertices, float) @ frame[:3, :3].T + frame[:3, 3]
             surface = Surface(vertices, np.asarray(part.faces, np.int64))
             pieces.setdefault(name, []).append(surface)
-    parts = {name: together(of) for name, of in pieces.items()}
+    parts = {name: combined(of) for name, of in pieces.items()}
     if not parts:
         raise MeshError("there are no triangles in it; expected a surface, not points or lines")
     if any(not np.all(np.isfinite(part.vertices)) for part in parts.values()):
@@ -158,5 +158,5 @@ def cartilage_of(parts, rings: str | None, path, scale, notes) -> Surface | None
             found = f"{rings!r}: {error}"
             raise MeshError(found, key="rings", joint="=") from error
     notes.append(f"rings: {rings}")
-    whole = together(found)
+    whole = combined(found)
     return Surface(whole.vertices * scale, whole.faces)

@@ -21,10 +21,10 @@ from jaxtrachea.scene.plan import Decision, ValidRange
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
+from jaxtrachea.tradeoff.cost import MIN_SAVING, Cost, Objective, describe
 from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program
-from jaxtrachea.tradeoff.price import MIN_SAVING, Cost, Objective, words
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -93,7 +93,7 @@ class Choice(NamedTuple):
             return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
         return (
             f"within {percent(self.tolerance)}: {changes(self.errors)} off the full program, "
-            f"{words(self.by, self.cost)}"
+            f"{describe(self.by, self.cost)}"
         )
 
 
@@ -150,7 +150,7 @@ def choose(
             break
     scene, material, path = program(full, levels)
     scene = _explained(scene, picked, found)
-    plan = dataclasses.replace(scene.plan, served=_served(trial.reference))
+    plan = dataclasses.replace(scene.plan, valid_range=_served(trial.reference))
     scene = dataclasses.replace(scene, plan=plan)
     return Choice(
         scene=scene, material=material, path=path, levels=levels, changed=changed,

@@ -38,7 +38,7 @@ class Load:
         return round(max(busy - own, 0.0) / max(wall, 1e-9), 2)
 
 
-def doubt(others: float | None) -> tuple[str, ...]:
+def load_warning(others: float | None) -> tuple[str, ...]:
     """That others were busy, in words; empty where the machine was quiet or is not known."""
     if others is None or others <= QUIET:
         return ()

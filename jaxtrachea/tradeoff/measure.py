@@ -13,12 +13,12 @@ from jaxtrachea._compiler import quick_options
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.tradeoff.choice import Choice
+from jaxtrachea.tradeoff.cost import Cost
 from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 from jaxtrachea.tradeoff.load import Load, processor
 from jaxtrachea.tradeoff.parts import inputs, part_of
-from jaxtrachea.tradeoff.price import Cost
 from jaxtrachea.tradeoff.timing import Compiled, Settings, compiled, timed, with_part
 
 __all__ = ["Settings", "choice_row", "environment", "measure", "measure_ladders"]

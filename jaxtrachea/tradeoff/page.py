@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from jaxtrachea.tradeoff.cost import HALF
 from jaxtrachea.tradeoff.front import front, worst
 from jaxtrachea.tradeoff.load import QUIET
-from jaxtrachea.tradeoff.price import HALF
 
 HEAD = ["ladder", "level", "force", "joints", "surface", "contact [mm]", "gradient",
         "part [µs]", "call [µs]", "99 %", "part, lane [µs]", "lane [µs]", "gradient [µs]",

@@ -13,10 +13,10 @@ from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses
 from jaxtrachea.tradeoff.calls import Call, turn_medians
+from jaxtrachea.tradeoff.cost import Cost, Objective, compiled, operations
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.price import Cost, Objective, compiled, operations
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))

@@ -17,12 +17,12 @@ from pathlib import Path
 import common
 import numpy as np
 
+from jaxtrachea.measurements.batch_checks import finish_all
 from jaxtrachea.measurements.checks import finish
 from jaxtrachea.measurements.curve import Curve, RawCurve, ReadOptions
 from jaxtrachea.measurements.read import Measurements, read_measurements, write_hdf5
 from jaxtrachea.measurements.readers import hdf5
 from jaxtrachea.measurements.tidy_writer import write_tidy
-from jaxtrachea.measurements.together import finish_all
 
 CURVES, SAMPLES, TRIALS, ROUNDS = 1000, 200, 5, 5
 #: Curves of the tidy table of 10^6 rows, and its rounds.

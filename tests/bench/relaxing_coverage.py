@@ -150,7 +150,7 @@ def apart(count, c):
                 curve, own = record(f"T{index:04d}", place, c[k], truth, 28.0, rng, relaxes)
                 curves.append(dataclasses.replace(curve, sigma=np.full(len(curve.time), own)))
         result = fitted(curves)
-        by_noise, by_shape = result.misfit.told[:, 0], result.effective.misses
+        by_noise, by_shape = result.misfit.flagged[:, 0], result.effective.misses
         told = by_noise | by_shape
         print(
             f"parts, {part} alone relaxes, {result.lanes} specimens: "

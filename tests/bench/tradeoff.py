@@ -76,10 +76,10 @@ def choices(name: str, full, settings) -> tuple[list[dict], list]:
     import jax
 
     from jaxtrachea.tradeoff.calls import turn_medians
+    from jaxtrachea.tradeoff.cost import Cost, compiled
     from jaxtrachea.tradeoff.levels import program
     from jaxtrachea.tradeoff.load import Load
     from jaxtrachea.tradeoff.measure import choice_row, environment
-    from jaxtrachea.tradeoff.price import Cost, compiled
 
     found = cheapest(name, full)
     say(f"{name}: choice: timing")

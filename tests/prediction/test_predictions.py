@@ -200,7 +200,7 @@ def test_an_angle_that_was_not_pressed_is_extrapolated():
 @pytest.mark.parametrize(("half_angle", "most"), [(120.0, 90.0), (105.0, 75.0)])
 def test_an_angle_that_sections_were_not_tested_at_is_refused(half_angle, most):
     """Beyond 90 degrees from the midline, or within 30 of the ends of the rings."""
-    from jaxtrachea.prediction.predict import check_aside
+    from jaxtrachea.prediction.predict import check_off_midline
 
     geometry = Geometry.create(160.0, [40.0, 80.0], half_angle=np.radians(half_angle))
     options = Options(skeleton="sections", contact="bonded")
@@ -208,12 +208,12 @@ def test_an_angle_that_sections_were_not_tested_at_is_refused(half_angle, most):
     fit = object.__new__(FitResult)
     object.__setattr__(fit, "study", SimpleNamespace(model=model))
     for phi in (0.0, most, -most):
-        check_aside(fit, np.radians(phi), (1.0, 0.0))
+        check_off_midline(fit, np.radians(phi), (1.0, 0.0))
     for phi in (most + 0.1, -most - 0.1, half_angle):
         with pytest.raises(ValueError, match=f"too near to the ends .*{most:g} deg"):
-            check_aside(fit, np.radians(phi), (1.0, 0.0))
+            check_off_midline(fit, np.radians(phi), (1.0, 0.0))
     with pytest.raises(ValueError, match=f"not on the cartilage; .*{half_angle:g} deg"):
-        check_aside(fit, np.radians(half_angle + 1), (1.0, 0.0))
+        check_off_midline(fit, np.radians(half_angle + 1), (1.0, 0.0))
 
 
 def test_rows_where_the_wall_moves_further_than_the_radius_are_told():

@@ -32,7 +32,13 @@ from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.ranges import contact_share, depth_share
-from jaxtrachea.scene.refusals import hidden_rows, hide, refuse, status_of, without_negative_values
+from jaxtrachea.scene.refusals import (
+    hidden_rows,
+    mask_rows,
+    refuse,
+    status_of,
+    without_negative_values,
+)
 from jaxtrachea.scene.stage import Tool, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
@@ -71,7 +77,7 @@ def admitted(scene, m, p, made=None):
         share = depth_share(scene, out.depth, out.skeleton, inward)
         return share, status_of(out.status, share, made, refused)
 
-    hidden = functools.partial(hide, hidden_rows(scene, refused))
+    hidden = functools.partial(mask_rows, hidden_rows(scene, refused))
     return m, presses.displacement, used, status, hidden
 
 

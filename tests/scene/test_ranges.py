@@ -159,14 +159,16 @@ def test_a_plan_of_the_midline_bends_its_rings_off_it():
 
 def test_a_plan_of_a_tolerance_serves_what_it_was_measured_for():
     """Rings as springs, right within 1 % at the place measured, are nowhere near it elsewhere."""
-    served = ValidRange((70.0, 80.0), angle=0.1, along=0.0, across=0.0, inward=3.0)
+    valid_range = ValidRange((70.0, 80.0), angle=0.1, along=0.0, across=0.0, inward=3.0)
     path = Presses(
         [75.0, 75, 75, 75, 90], [0.0, 0.5, 0.0, 0.0, 0.0],
         [[0, -3.0, 0], [0, -2, -1], [1, -3, 0], [0, -4, 0], [0, -3, 0]],
     )  # fmt: skip
     effects = dataclasses.replace(ONE, rings="mat", axial="off")
     scene = make_scene(TUBE, MATERIAL, path, effects=effects)
-    chosen = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, served=served))
+    chosen = dataclasses.replace(
+        scene, plan=dataclasses.replace(scene.plan, valid_range=valid_range)
+    )
     assert needing_more(scene, MATERIAL, path) == [0] * 5
     assert needing_more(chosen, MATERIAL, path) == [0, 1, 1, 1, 1]
 

@@ -47,13 +47,13 @@ def filled_up(tube):
         return np.concatenate([v, np.repeat(v[:1], lacking, 0) + away])
 
     cores = longer(np.concatenate([cores, inside], axis=2), 1e4)
-    doubtful = np.zeros(TUBE.rings, bool)
-    if tube.doubtful is not None:
-        doubtful[: len(tube.doubtful)] = tube.doubtful
+    uncertain = np.zeros(TUBE.rings, bool)
+    if tube.uncertain is not None:
+        uncertain[: len(tube.uncertain)] = tube.uncertain
     return dataclasses.replace(
         tube, shapes=Shape(jnp.asarray(cores), jnp.asarray(longer(tube.shapes.radius))),
         centres=jnp.asarray(longer(tube.centres, 1e4)), lost=jnp.asarray(longer(tube.lost)),
-        filled=jnp.asarray(longer(tube.filled)), doubtful=jnp.asarray(doubtful),
+        filled=jnp.asarray(longer(tube.filled)), uncertain=jnp.asarray(uncertain),
     )  # fmt: skip
 
 
@@ -232,7 +232,7 @@ def test_patches_beside_the_wall_are_refused():
     """A waist of 4 mm within one patch: a ball would touch where there is nothing."""
     thin = waist(MESHES[1], 70, 0.35, 4)
     good = walls_.checked_walls(TUBE, bend(MESHES[1], 300.0))
-    assert good.doubtful is None
+    assert good.uncertain is None
     says = r"gap is off by .* at worst \(at s = .* expected at most"
     with pytest.raises(MeshError, match=says):
         make_scene(TUBE, SPRINGS, poses([75, 19, 0], [75, 17, 0]), tool=BALL, mesh=thin)
@@ -296,7 +296,7 @@ def test_a_wall_with_one_ring_is_checked_about_it(at):
     assert seen.s.max() < at + 11.3
     assert np.ptp(seen.s) > 15
     beyond = wall_check.look_beyond(mesh, geometry, walls)
-    assert not beyond.doubtful.any()
+    assert not beyond.uncertain.any()
     # A wall that is not there is refused as with many rings.
     vertices = jnp.asarray(np.asarray(mesh.vertices) * [1, 0.8, 0.8])
     shrunk = dataclasses.replace(mesh, vertices=vertices)

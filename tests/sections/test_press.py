@@ -202,7 +202,7 @@ def test_near_the_ends_of_the_rings_is_said(dtype):
         assert row.status[-1] == PressStatus.NO_CONTACT
         assert np.all(np.isfinite(row.force))
     np.testing.assert_allclose(inward(got[1], angles[1]), inward(got[0], right), atol=1e-3)
-    assert float(press_module.tested_angle(jnp.asarray(1.7))) == pytest.approx(1.7 - np.pi / 6)
+    assert float(press_module.validated_angle(jnp.asarray(1.7))) == pytest.approx(1.7 - np.pi / 6)
 
 
 @pytest.mark.slow

@@ -86,5 +86,5 @@ BOOTSTRAP = Analysis(
     attributes=("kind", "block"),
     table=bootstrap_table,
     section=_section,
-    shown=lambda found: [found.note] if found.note else [],
+    sentences=lambda found: [found.note] if found.note else [],
 )

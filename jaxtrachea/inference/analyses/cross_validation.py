@@ -10,9 +10,9 @@ from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.cross_validation import LeftOut, curves_to_leave_out, leave_one_out
+from jaxtrachea.inference.holdout_groups import holdout_sentence
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
-from jaxtrachea.inference.together import together_sentence
 
 _ERRORS = {
     "force_over_model": "force / model",
@@ -63,7 +63,7 @@ def left_out_table(left_out: LeftOut) -> Table:
     return Table([*rows, mean], COLUMNS, title="Leaving one curve out", more=more)
 
 
-def own_touch_sentence(study: Study, which: str) -> list[str]:
+def own_onset_sentence(study: Study, which: str) -> list[str]:
     """That a curve left out has an onset or an offset fitted to itself; empty where it has none."""
     own = [p.name for p in study.free if p.scope == "trial" and p.name in OF_THE_PRESS]
     if not own:
@@ -74,13 +74,13 @@ def own_touch_sentence(study: Study, which: str) -> list[str]:
 
 
 def _section(found: LeftOut) -> list[str]:
-    parts = own_touch_sentence(found.study, "A curve left out")
-    parts += [f"{text}." for text in together_sentence(found.study.together)]
+    parts = own_onset_sentence(found.study, "A curve left out")
+    parts += [f"{text}." for text in holdout_sentence(found.study.holdout_groups)]
     return [*parts, f"{found.sentence}."] if found.sentence else parts
 
 
 def _shown(found: LeftOut) -> Iterator[str]:
-    yield from together_sentence(found.study.together)
+    yield from holdout_sentence(found.study.holdout_groups)
     if found.sentence:
         yield found.sentence
     if not np.isfinite(rms(found.force)):
@@ -97,5 +97,5 @@ LEFT_OUT = Analysis(
     tables=lambda found: {"left_out.csv": Table(left_out_rows(found))},
     table=lambda found, lanes: left_out_table(found),
     section=_section,
-    shown=_shown,
+    sentences=_shown,
 )

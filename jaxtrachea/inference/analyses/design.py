@@ -232,8 +232,8 @@ DESIGN = Analysis(
     commands=("design",),
     refuse=_refuse,
     tables=_tables,
-    place="design",
+    report_section="design",
     table=_table,
-    shown=_shown,
+    sentences=_shown,
     figures=lambda found: {"identifiability.png": lambda: draw_design(found)},
 )

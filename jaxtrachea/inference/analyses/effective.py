@@ -97,7 +97,7 @@ EFFECTIVE = Analysis(
     asked=lambda request: True,
     lane_cells=_lane_cells,
     parameter_cells=_cells,
-    place="quality",
+    report_section="quality",
     section=_section,
-    shown=_sentences,
+    sentences=_sentences,
 )

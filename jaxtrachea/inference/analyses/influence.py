@@ -247,8 +247,8 @@ INFLUENCE = Analysis(
     option="influence",
     key="influence",
     tables=_tables,
-    place="data",
+    report_section="data",
     table=lambda found, lanes: influence_table(found),
     section=_section,
-    shown=_shown,
+    sentences=_shown,
 )

@@ -45,14 +45,14 @@ def _sentences(result: FitResult) -> list[str]:
     """The share of the force in the noise; residuals larger than the noise given, and smaller."""
     compared, every, said = result.misfit, result.lanes, _share(result)
     for k, (kind, key) in enumerate((("Force", "noise.force"), ("Marker", "noise.joints"))):
-        ratio, told = compared.ratio[:, k], compared.told[:, k]
+        ratio, flagged = compared.ratio[:, k], compared.flagged[:, k]
         for beyond, cause in (
             (ratio > 1, "the noise given is too small, or the model misses the curves: standard "
              "errors and intervals have grown"),
             (ratio < 1, "the noise given is too large: standard errors and intervals, which rest "
              "on it, are too large"),
         ):  # fmt: skip
-            lanes = np.flatnonzero(told & beyond)
+            lanes = np.flatnonzero(flagged & beyond)
             if len(lanes):
                 median = float(np.median(ratio[lanes]))
                 where = f" in {len(lanes)} of {every} fits" if every > 1 else ""
@@ -74,7 +74,7 @@ MISFIT = Analysis(
     compute=_compute,
     asked=lambda request: True,
     lane_cells=_lane_cells,
-    place="quality",
+    report_section="quality",
     section=_sentences,
-    shown=_shown,
+    sentences=_shown,
 )

@@ -38,67 +38,67 @@ def _compute(request: Request, findings: AnalysisResults, progress: Progress) ->
     )  # fmt: skip
 
 
-def _cells(drawn: Posterior, lane: int, i: int) -> Cells:
+def _cells(posterior: Posterior, lane: int, i: int) -> Cells:
     """What chains say; of poor ones it stands in results.h5 alone, for those who look into it."""
-    verdict = drawn.verdict(lane)
+    verdict = posterior.verdict(lane)
     poor = verdict.startswith("poor")
-    ends = {"median": drawn.median, "low95": drawn.lower, "high95": drawn.upper}
+    ends = {"median": posterior.median, "low95": posterior.lower, "high95": posterior.upper}
     cells = {f"posterior_{name}": None if poor else float(v[lane, i]) for name, v in ends.items()}
     return cells | {
-        "posterior_rhat": float(drawn.rhat[lane, i]),
-        "posterior_ess": float(drawn.ess[lane, i]),
+        "posterior_rhat": float(posterior.rhat[lane, i]),
+        "posterior_ess": float(posterior.ess[lane, i]),
         "posterior_verdict": verdict,
     }
 
 
-def not_good(drawn: Posterior) -> dict[int, str]:
+def not_good(posterior: Posterior) -> dict[int, str]:
     """Lanes whose chains are not good, with the verdict on them; poor ones first."""
-    words = {lane: drawn.verdict(lane) for lane in range(drawn.result.lanes)}
+    words = {lane: posterior.verdict(lane) for lane in range(posterior.result.lanes)}
     bad = {k: text for k, text in words.items() if not text.startswith("good")}
     return dict(sorted(bad.items(), key=lambda item: not item[1].startswith(("poor", "no draws"))))
 
 
-def distrust(drawn: Posterior) -> list[str]:
+def distrust(posterior: Posterior) -> list[str]:
     """A paragraph on the draws that deserve no trust; none if all do."""
-    bad = not_good(drawn)
+    bad = not_good(posterior)
     if not bad:
         return []
-    named = [f"{lane_label(drawn.result, k)} {bad[k]}" for k in list(bad)[:_NAMED]]
+    named = [f"{lane_label(posterior.result, k)} {bad[k]}" for k in list(bad)[:_NAMED]]
     more = f"; and {len(bad) - _NAMED} more, see parameters.csv" if len(bad) > _NAMED else ""
     return [
-        f"**The posterior of {len(bad)} of {drawn.result.lanes} fits is not to be trusted as it "
-        f"stands**: {'; '.join(named)}{more}. Draw more, or look at the profiles."
+        f"**The posterior of {len(bad)} of {posterior.result.lanes} fits is not to be trusted as "
+        f"it stands**: {'; '.join(named)}{more}. Draw more, or look at the profiles."
     ]
 
 
-def posterior_table(drawn: Posterior, lanes: Sequence[int]) -> Table:
+def posterior_table(posterior: Posterior, lanes: Sequence[int]) -> Table:
     """Medians, intervals and what they are worth; poor chains have neither median nor interval."""
-    result = drawn.result
+    result = posterior.result
     return Table(
-        unknown_rows(result, lanes, lambda lane, i: _cells(drawn, lane, i)),
+        unknown_rows(result, lanes, lambda lane, i: _cells(posterior, lane, i)),
         COLUMNS,
         title="Posterior",
         more=and_more(result.lanes, len(lanes), "parameters.csv"),
     )
 
 
-def _section(drawn: Posterior) -> list[str]:
+def _section(posterior: Posterior) -> list[str]:
     """How many draws there are, and whether the chains deserve trust."""
-    chains, draws = drawn.theta.shape[1:3]
-    longer = drawn.steps[drawn.steps > draws]
+    chains, draws = posterior.theta.shape[1:3]
+    longer = posterior.steps[posterior.steps > draws]
     more = f", {longer.min()} to {longer.max()} in {len(longer)} fits" if len(longer) else ""
     return [
         f"{chains} chains of {draws} draws (NUTS{more}), priors uniform in scaled coordinates "
         "between the bounds. Good: R-hat up to 1.01, 400 effective draws, nothing divergent. Of "
         "poor chains (R-hat above 1.05, less than 100 effective draws, or more than 2 % divergent) "
         "no interval is given. All draws: `results.h5` (docs/read_a_fit.md).",
-        *(distrust(drawn) or ["All chains are good."]),
+        *(distrust(posterior) or ["All chains are good."]),
     ]
 
 
-def _poor(drawn: Posterior) -> bool:
+def _poor(posterior: Posterior) -> bool:
     """Whether some lane's chains are poor."""
-    return any(drawn.verdict(lane).startswith("poor") for lane in range(drawn.result.lanes))
+    return any(posterior.verdict(lane).startswith("poor") for lane in range(posterior.result.lanes))
 
 
 POSTERIOR = Analysis(
@@ -121,9 +121,9 @@ POSTERIOR = Analysis(
         "lower",
         "upper",
     ),  # fmt: skip
-    place="data",
+    report_section="data",
     table=posterior_table,
     section=_section,
     warning=distrust,
-    poor=_poor,
+    unreliable=_poor,
 )

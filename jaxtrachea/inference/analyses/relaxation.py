@@ -213,7 +213,7 @@ RELAXATION = Analysis(
     compute=_compute,
     asked=lambda request: request.study.model.relaxes,
     tables=_tables,
-    place="checks",
+    report_section="checks",
     section=_section,
     figures=_figures,
 )

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.onset import counted_from
-from jaxtrachea.fitting.refusals import depths, untested
+from jaxtrachea.fitting.refusals import depths, unvalidated
 from jaxtrachea.fitting.study import Study
 
 #: Candidates where the user does not say: of a level that iterates, and of a formula, which costs
@@ -108,7 +108,7 @@ def extrapolation(study: Study, depth: float, reach: tuple[float, float] | None 
     counted, model = counted_from(study.parameters), study.model
     beyond = depth > high + 1e-9
     known = f"extrapolated from data at D = {low:.3g} to {high:.3g} mm{counted}" if beyond else ""
-    tested = untested(model.options, float(model.geometry.radius), depth, counted)
+    tested = unvalidated(model.options, float(model.geometry.radius), depth, counted)
     return "; ".join(filter(None, [known, tested]))
 
 
@@ -197,7 +197,7 @@ def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
     if asked is None:
         measured = (c.phi_c for curves in study.curves for c in curves)
         return sorted({round(float(phi), 9) + 0.0 for phi in measured})
-    reach = study.model.level.tested_angle(float(study.model.geometry.half_angle))
+    reach = study.model.level.validated_angle(float(study.model.geometry.half_angle))
     for phi in asked:
         if not abs(phi) <= reach:
             raise SpecError(

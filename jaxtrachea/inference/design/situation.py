@@ -151,8 +151,8 @@ def _sample_sigma(result: FitResult) -> Float[np.ndarray, " lanes"]:
     force2 = np.asarray(lanes.force) ** 2
     with np.errstate(invalid="ignore", divide="ignore"):
         known = np.sum(force2 * (lanes.precision > 0), axis=(1, 2))
-        told = np.sum(force2 * np.asarray(lanes.precision) ** 2, axis=(1, 2))
-        mean = result.whitened_sigma[:, 0] * np.sqrt(known / told)
+        weighted = np.sum(force2 * np.asarray(lanes.precision) ** 2, axis=(1, 2))
+        mean = result.whitened_sigma[:, 0] * np.sqrt(known / weighted)
     return np.where(result.force_share > 0, mean, result.sigma[:, 0])
 
 

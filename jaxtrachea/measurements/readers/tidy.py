@@ -192,17 +192,17 @@ def _curves(
     time = time_column(names, table.header.units, roles, options)
     texts = {roles[role] for role in ("specimen", "trial") if role in roles}
     numbers = {roles[role] for role in units} | ({time[0]} if time else set())
-    unread = [i for i, name in enumerate(names) if name and i not in texts | numbers]
-    table.load({*numbers, *unread}, texts)
+    unused_columns = [i for i, name in enumerate(names) if name and i not in texts | numbers]
+    table.load({*numbers, *unused_columns}, texts)
     named = _named(table.text, {*roles, *state}, options)
     groups = _group(table, roles, state, named)
     starts = np.array([rows.start for rows in groups.values()])
     table.check_groups(numbers, starts)
     if time and time[1] is None and table.is_read(time[0]):  # numbers without a unit
-        unread.append(time[0])
+        unused_columns.append(time[0])
     study = _Study(
-        table=table, roles=roles, units=units, state=state, named=named, unread=unread,
-        options=options,
+        table=table, roles=roles, units=units, state=state, named=named,
+        unused_columns=unused_columns, options=options,
     )  # fmt: skip
     return [_curve(study, key, rows) for key, rows in groups.items()]
 
@@ -216,7 +216,7 @@ class _Study(NamedTuple):
         units: unit of each role of numbers.
         state: from the first line.
         named: from the name of the file.
-        unread: columns without a role.
+        unused_columns: columns without a role.
         options: columns, units and naming.
     """
 
@@ -225,7 +225,7 @@ class _Study(NamedTuple):
     units: dict[str, str]
     state: dict
     named: FileIdentity | None
-    unread: list[int]
+    unused_columns: list[int]
     options: ReadOptions
 
 
@@ -310,21 +310,23 @@ def _curve(study: _Study, key: tuple[str, str], picked: slice) -> RawCurve | Bad
             phi=_agreed("phi", _constant("phi", values, state, table, rows), named),
             time=table.time(study.roles, study.options, picked),
             direction=state.get("direction", (1.0, 0.0)),
-            unread=tuple(table.names[i] for i in study.unread),
+            unused_columns=tuple(table.names[i] for i in study.unused_columns),
             notes=tuple(table.notes),
             conditions=(
                 *state.get("conditions", ()),
                 *(named.conditions if named else ()),
-                *_conditions(table, study.unread, picked),
+                *_conditions(table, study.unused_columns, picked),
             ),
         )
     except Fault as fault:
         return bad(*key, source, fault)
 
 
-def _conditions(table: Table, unread: Sequence[int], picked: slice) -> Iterator[tuple[str, float]]:
+def _conditions(
+    table: Table, unused_columns: Sequence[int], picked: slice
+) -> Iterator[tuple[str, float]]:
     """Columns without a role that hold one number in a curve, but for a twentieth of it."""
-    for i in unread:
+    for i in unused_columns:
         try:
             values = np.array([*map(float, table.raw(i)[picked])])
         except ValueError:

@@ -131,7 +131,7 @@ class Closed(Protocol):
         """Compliance that the contact force depends on."""
         ...
 
-    def touch(self, displacement: Any, onset: Any, blend: Any = None) -> Any:
+    def indentation(self, displacement: Any, onset: Any, blend: Any = None) -> Any:
         """Displacement after first touch, mm."""
         ...
 
@@ -177,7 +177,7 @@ class Level(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def tested(self) -> float:
+    def validated_depth(self) -> float:
         """Depth to which it was compared with finite elements, in radii of the tube."""
 
     @property
@@ -204,7 +204,7 @@ class Level(abc.ABC):
         """How its force relaxes; None: it does not."""
         return None
 
-    def tested_angle(self, half_angle: float) -> float:
+    def validated_angle(self, half_angle: float) -> float:
         """Angle from the midline to which it was tested, rad; 0: it presses there alone."""
         return 0.0
 

@@ -10,11 +10,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics import press as _press
-from jaxtrachea.mechanics.admission import check_shapes, without_negative
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.press_in_time import press_in_time
+from jaxtrachea.mechanics.validation import check_shapes, without_negative
 from jaxtrachea.relaxation.filter import Relaxation
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import DEEP, OF_PRESS, VALUES, Material, material_of
@@ -49,7 +49,7 @@ class Line(Level):
         return self.options.skeleton
 
     @property
-    def tested(self) -> float:
+    def validated_depth(self) -> float:
         """See `VALIDATED_DEPTH`; without limit where the force knows no skeleton."""
         return np.inf if self.options.coupling == "total" else VALIDATED_DEPTH[self.name]
 
@@ -174,9 +174,9 @@ class Line(Level):
         """None with the paper's total coupling."""
         return compliance if self.options.coupling == "series" else jnp.zeros_like(compliance)
 
-    def touch(self, displacement: Any, onset: Any, blend: Any = None) -> Any:
+    def indentation(self, displacement: Any, onset: Any, blend: Any = None) -> Any:
         """See `press.touch`."""
-        return _press.touch(displacement, onset, self.options, blend)
+        return _press.indentation(displacement, onset, self.options, blend)
 
     def respond(self, displacement: Any, compliance: Any, contact: _press.Contact) -> Equilibrium:
         """See `press.respond`."""

@@ -17,7 +17,7 @@ from jaxtrachea.mechanics.sections.press import (
     SectionOptions,
     press_sections,
     safe_values,
-    tested_angle,
+    validated_angle,
 )
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.trachea.geometry import Geometry
@@ -53,13 +53,13 @@ class Sections(Level):
         return self.options.skeleton
 
     @property
-    def tested(self) -> float:
+    def validated_depth(self) -> float:
         """See `VALIDATED_DEPTH`."""
         return VALIDATED_DEPTH
 
-    def tested_angle(self, half_angle: float) -> float:
-        """See `press.tested_angle`, with what rounding takes."""
-        return float(tested_angle(half_angle)) + 1e-6
+    def validated_angle(self, half_angle: float) -> float:
+        """See `press.validated_angle`, with what rounding takes."""
+        return float(validated_angle(half_angle)) + 1e-6
 
     def deepest(self, radius: float) -> float:
         """The tube has no more room than its radius."""
@@ -98,7 +98,7 @@ class Sections(Level):
                 f"{at} on the cartilage, within {np.degrees(size.half_angle):.3g} deg of the "
                 "midline"
             )
-        if not abs(curve.phi_c) <= (most := self.tested_angle(size.half_angle)):
+        if not abs(curve.phi_c) <= (most := self.validated_angle(size.half_angle)):
             return InputError(
                 f"{at} within {np.degrees(most):.3g} deg of the midline: nearer to the ends of the "
                 "rings deforming cross-sections are too stiff",

@@ -79,45 +79,46 @@ class SectionMaterial(eqx.Module):
     EI_C: Float[Array, "..."] = _declared(VALUES["EI_C"])
     EI_M: Float[Array, "..."] = _field(
         "EI_M", "N mm^2", "bending_stiffness", "bending stiffness of the muscle behind, each ring",
-        _fixed(2.0), each="ring",
+        _fixed(2.0), varies_by="ring",
     )  # fmt: skip
     Et_M: Float[Array, "..."] = _field(
         "Et_M", "N/mm", "stiffness", "modulus times thickness of the muscle around the tube",
-        _fixed(0.65), each="ring",
+        _fixed(0.65), varies_by="ring",
     )  # fmt: skip
     bed_n: Float[Array, "..."] = _field(
         "bed_n", "N/mm^3", "cubic_stiffness",
         "bed behind the muscle, on its outer surface, along the normal",
-        Fitted(0.02, 1e-8, 1e3), each="ring",
+        Fitted(0.02, 1e-8, 1e3), varies_by="ring",
     )  # fmt: skip
     bed_t: Float[Array, "..."] = _field(
         "bed_t", "N/mm^3", "cubic_stiffness",
         "bed behind the muscle, on its outer surface, along the circumference",
-        Fitted(0.002, 1e-8, 1e3), each="ring",
+        Fitted(0.002, 1e-8, 1e3), varies_by="ring",
     )  # fmt: skip
     Gt_L: Float[Array, "..."] = _field(
         "Gt_L", "N/mm", "stiffness", "shear modulus times thickness of the wall between rings",
-        _fixed(20.0), each="span",
+        _fixed(20.0), varies_by="span",
     )  # fmt: skip
     Et_L: Float[Array, "..."] = _field(
         "Et_L", "N/mm", "stiffness", "modulus along the tube times thickness of that wall",
-        Fitted(1.2, 1e-5, 1e5), each="span",
+        Fitted(1.2, 1e-5, 1e5), varies_by="span",
     )  # fmt: skip
     D_L: Float[Array, "..."] = _field(
         "D_L", "N mm", "moment", "bending stiffness of that wall, each length",
-        Fitted(4.0, 1e-5, 1e5), each="span",
+        Fitted(4.0, 1e-5, 1e5), varies_by="span",
     )  # fmt: skip
     c_W: Float[Array, "..."] = _field(
         "c_W", "1/N/mm", "inverse_energy", "softening of a span with its energy",
-        Fitted(0.9, 1e-6, 1e4), each="span",
+        Fitted(0.9, 1e-6, 1e4), varies_by="span",
     )  # fmt: skip
     c_K: Float[Array, "..."] = _field(
         "c_K", "mm^2", "area", "softening of bending in a ring",
-        _fixed(0.0, 0.0, 1e6, scale="linear", step=10.0), default=0.0, signed=True, each="ring",
+        _fixed(0.0, 0.0, 1e6, scale="linear", step=10.0), default=0.0, signed=True,
+        varies_by="ring",
     )  # fmt: skip
     rho: Float[Array, "..."] = _field(
         "rho", "1", "dimensionless", "share of the muscle in shear and stretch of the wall",
-        _fixed(1e-3, 1e-9, 10.0), default=1e-3, each="span",
+        _fixed(1e-3, 1e-9, 10.0), default=1e-3, varies_by="span",
     )  # fmt: skip
     c_end: Float[Array, ""] = _field(
         "c_end", "1", "dimensionless", "share of c_W that the spans at the clamped ends have",

@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_record, shaped
 from jaxtrachea._numerics import epsilon, full_precision, largest
-from jaxtrachea.mechanics.admission import hide
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections import section, span, system
 from jaxtrachea.mechanics.sections.contact import place_on
@@ -33,6 +32,7 @@ from jaxtrachea.mechanics.sections.solve import Solved, solve_path
 from jaxtrachea.mechanics.sections.system import State, System
 from jaxtrachea.mechanics.sections.wall import Contact, WallModes, modes_along
 from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.mechanics.validation import mask
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -40,7 +40,7 @@ from jaxtrachea.trachea.geometry import Geometry
 SIDE, END = np.pi / 2, np.pi / 6
 
 
-def tested_angle(half_angle: Float[Array, ""] | float) -> Float[Array, ""]:
+def validated_angle(half_angle: Float[Array, ""] | float) -> Float[Array, ""]:
     """Angle from the midline, rad, to which presses are right; NEAR_RING_END beyond.
 
     Nearer to its end a ring that is pressed bends its muscle over a length of (4 EI / k)^(1/4),
@@ -142,7 +142,7 @@ def press_sections(
     Returns:
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
         energy (and those after the latter) are NaN, PAST_FOLD; others are untouched. Rows whose
-        wall moves further than the radius are TOO_DEEP, and those beyond `tested_angle`
+        wall moves further than the radius are TOO_DEEP, and those beyond `validated_angle`
         NEAR_RING_END, with their values; those of a material that is `extrapolated` are
         EXTRAPOLATED. Derivatives are those of the equilibrium, in either mode.
 
@@ -194,12 +194,12 @@ def _press(
         found = found._replace(along=along(solved.state, places, nodes, contact, parts))
     found = found._replace(steps=solved.steps, status=status)
     valid = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
-    hidden = jax.vmap(hide)(jnp.where(valid, PressStatus.OK, status), found)
+    hidden = jax.vmap(mask)(jnp.where(valid, PressStatus.OK, status), found)
     moved = jnp.sum(found.skeleton**2, axis=1)
     deep = (status == PressStatus.OK) & (moved > geometry.radius**2)
     status = jnp.where(deep, PressStatus.TOO_DEEP, status)
     # To rounding, as in `on_ring`.
-    most = tested_angle(geometry.half_angle) * (1 + 8 * epsilon(phi_c.dtype))
+    most = validated_angle(geometry.half_angle) * (1 + 8 * epsilon(phi_c.dtype))
     near = (status == PressStatus.OK) & (jnp.abs(phi_c) > most)
     status = jnp.where(near, PressStatus.NEAR_RING_END, status)
     unlike = (status == PressStatus.OK) & (material.extrapolated > 0)

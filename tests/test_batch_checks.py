@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from jaxtrachea.measurements import together
+from jaxtrachea.measurements.batch_checks import finish_all
 from jaxtrachea.measurements.checks import bad, finish
 from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
 from jaxtrachea.measurements.holds import may_hold, rises_evenly
-from jaxtrachea.measurements.together import finish_all
 
 RAMP = np.linspace(0.0, 5.0, 30)
 

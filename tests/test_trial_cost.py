@@ -20,11 +20,11 @@ from jaxtrachea.tradeoff import choice as choosing
 from jaxtrachea.tradeoff import trial as trying
 from jaxtrachea.tradeoff.calls import FEWEST, TURNS, one_pose, turn_medians, whole_path
 from jaxtrachea.tradeoff.choice import choose
+from jaxtrachea.tradeoff.cost import MIN_SAVING, Cost, describe, operations
 from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import Ladder
 from jaxtrachea.tradeoff.levels import BUILT_IN, cast, full_scene, program
-from jaxtrachea.tradeoff.load import QUIET, Load, doubt
-from jaxtrachea.tradeoff.price import MIN_SAVING, Cost, operations, words
+from jaxtrachea.tradeoff.load import QUIET, Load, load_warning
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -141,9 +141,9 @@ def test_what_saves_no_time_is_not_dropped(by, times, expected, monkeypatch):
     assert by_time.cost == (2e-3, share, share, share)
     assert set(asked) == {by}
     said = {"shear": "50 % of its time (50 to 50 %, measured", "local": "40 % of its time"}
-    words = [said[v] for v in BOTH if v in expected]
-    words = words[-1] if words else "nothing that is within 10 % surely saves time"
-    assert words in by_time.sentence
+    describe = [said[v] for v in BOTH if v in expected]
+    describe = describe[-1] if describe else "nothing that is within 10 % surely saves time"
+    assert describe in by_time.sentence
     reasons = {e.name: e.reason for e in by_time.scene.plan.effects}
     assert ("not surely save time" in reasons["two_material"]) == ("local" not in expected)
     by_operations = choose(trial, 0.1, precision="float64")
@@ -181,7 +181,7 @@ def test_operations_as_by_hand():
     count = float(count_operations(simulate, *arguments))
     assert operations(arguments) == count
     assert operations(cast(arguments, "float32")) == count / 2
-    assert words("operations", Cost.exact(count, count / 2)) == "50 % of its cost"
+    assert describe("operations", Cost.exact(count, count / 2)) == "50 % of its cost"
 
 
 def test_the_full_program_is_its_own_measure(monkeypatch):
@@ -295,6 +295,6 @@ def test_others_at_work_are_told():
     others = load.others()
     assert others is None or others >= 0
     for busy in (None, 0.0, QUIET):
-        assert doubt(busy) == ()
-    (said,) = doubt(0.9)
+        assert load_warning(busy) == ()
+    (said,) = load_warning(0.9)
     assert "machine was busy (0.9 cores)" in said

@@ -36,7 +36,7 @@ class Validated(NamedTuple):
     refused: Int[Array, ""]
 
 
-def admit(
+def validate(
     geometry: Geometry,
     material: Material,
     s_c: ArrayLike,
@@ -106,10 +106,10 @@ def check_shapes(geometry: Geometry, material: Material) -> None:
         value, name = getattr(material, field.name), f"Material.{field.name}"
         if value is None:
             continue
-        if VALUES[field.name].each == "span":
+        if VALUES[field.name].varies_by == "span":
             why = f" ({rings} rings make {rings + 1} spans)"
             shaped(name, value, (), (rings + 1,), why=why)
-        elif VALUES[field.name].each == "ring":
+        elif VALUES[field.name].varies_by == "ring":
             shaped(name, value, (), (rings,), why=" (one for each ring)")
         else:
             shaped(name, value, ())
@@ -166,14 +166,14 @@ def has_solution(status: Int[Array, "*n"]) -> Bool[Array, "*n"]:
     return functools.reduce(operator.or_, (status == s for s in PressStatus if s.solved))
 
 
-def hide(refused: Int[Array, ""], *arrays: Any) -> Any:
+def mask(refused: Int[Array, ""], *arrays: Any) -> Any:
     """NaN for every number of a refused press.
 
     Where products of several of these are returned, hiding the factors is enough, and cheaper:
     `where` passes no derivative, not even NaN, to what it hides.
 
     Args:
-        refused: from `admit`.
+        refused: from `validate`.
         arrays: arrays and trees of arrays; what is not floating stays.
 
     Returns:

@@ -79,7 +79,7 @@ class Outcome:
 rank = operator.attrgetter("rank")
 
 
-def judge(case: Case, truth: Truth | None, faults: list[str], values, status, jacobians):
+def assess(case: Case, truth: Truth | None, faults: list[str], values, status, jacobians):
     """(worst value, worst derivative, number of values that are not finite)."""
     if int(status) != case.code:
         faults.append(f"status {int(status)}, expected {case.code} ({case.status})")

@@ -16,7 +16,7 @@ from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, Read
 from jaxtrachea.measurements.holds import rises_evenly
 from jaxtrachea.measurements.observed import FURTHER_FIELDS
 from jaxtrachea.measurements.parts import Segment
-from jaxtrachea.measurements.plausible import doubt_of
+from jaxtrachea.measurements.plausible import implausible_extent
 from jaxtrachea.measurements.record_faults import suspicious
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.measurements.vectors import (
@@ -224,7 +224,7 @@ def _curve(
     if abs(phi_c) > 2 * math.pi:
         return None
     low, high = block.low[k], block.high[k]
-    doubtful = doubt_of(high - low, block.peak[k])
+    doubtful = implausible_extent(high - low, block.peak[k])
     return Curve(
         specimen=raw.specimen,
         trial=raw.trial,

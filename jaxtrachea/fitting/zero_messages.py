@@ -16,7 +16,7 @@ _NAMES = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
+class FittedZeros:
     """What the record of a curve shows and what it takes of it; NaN: not taken.
 
     Attributes:
@@ -42,20 +42,22 @@ class Shown:
         return f"{self.curve.specimen} {self.curve.trial}"
 
 
-def shown(study: Study) -> list[Shown]:
+def fitted_zeros(study: Study) -> list[FittedZeros]:
     """Curves that take something from their records, in the order of the lanes."""
     if study.record_zeros is None:
         return []
     rows = zip(study.curves, study.record_zeros, strict=True)
     every = [
-        Shown(c, *map(float, v)) for lane, row in rows for c, v in zip(lane, row, strict=False)
+        FittedZeros(c, *map(float, v))
+        for lane, row in rows
+        for c, v in zip(lane, row, strict=False)
     ]
     return [s for s in every if not np.isnan([s.onset, s.force_offset, s.force_slope]).all()]
 
 
 def sentences(study: Study) -> list[str]:
     """What the curves of a study take from their records, and what was held against a record."""
-    every, count = shown(study), sum(map(len, study.curves))
+    every, count = fitted_zeros(study), sum(map(len, study.curves))
     air = [s for s in every if not s.loaded]
     touched = [s for s in air if not np.isnan(s.onset)]
     out = _listed(
@@ -80,12 +82,12 @@ def sentences(study: Study) -> list[str]:
     return [*out, *_under_load([s for s in every if s.loaded], count), *_held(study)]
 
 
-def _share(s: Shown) -> float:
+def _share(s: FittedZeros) -> float:
     D = s.curve.displacement
     return 100 * max(s.onset - float(D.min()), 0.0) / float(np.ptp(D))
 
 
-def _listed(some: Sequence[Shown], count: int, what: str, value, more) -> list[str]:
+def _listed(some: Sequence[FittedZeros], count: int, what: str, value, more) -> list[str]:
     """One sentence a curve of few, one for all of many."""
     if len(some) <= _NAMES:
         return [f"{what} of {s.name}: {value(s)}{more(s)}" for s in some]
@@ -97,7 +99,7 @@ def _listed(some: Sequence[Shown], count: int, what: str, value, more) -> list[s
     ]
 
 
-def _under_load(some: Sequence[Shown], count: int) -> list[str]:
+def _under_load(some: Sequence[FittedZeros], count: int) -> list[str]:
     """What is said of records that begin under load."""
     if not some:
         return []
@@ -155,5 +157,5 @@ def cells(study: Study) -> dict[tuple[str, str], dict[str, object]]:
             for name in OF_THE_PRESS
             if not np.isnan(value := getattr(s, name))
         }
-        for s in shown(study)
+        for s in fitted_zeros(study)
     }

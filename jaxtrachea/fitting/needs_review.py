@@ -30,7 +30,7 @@ _SITUATED = [
 ]  # fmt: skip
 
 
-def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
+def needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
     """Unknowns of succeeded lanes that give cause, other than those that the structure leaves open.
 
     Args:
@@ -60,14 +60,14 @@ def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
     return present & (doubt | everything[:, None])
 
 
-def left_in_doubt(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
-    """`doubtful` unknowns of a fit that nothing further will look at.
+def still_needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
+    """`needs_review` unknowns of a fit that nothing further will look at.
 
     An unknown that all lanes of a joint fit share is in doubt where half of them say so. What is
     measured against the press (onset, offset) is seen by its own curve, whatever the others do: it
     stands by its own error.
     """
-    doubt = doubtful(result, minima)
+    doubt = needs_review(result, minima)
     study = result.study
     shared = study.shared
     if shared.size:

@@ -91,7 +91,7 @@ def compiled(by: Time, arguments: Arguments) -> Call:
     return {"path": whole_path, "step": one_pose}[by](arguments)
 
 
-def words(by: Objective, cost: Cost) -> str:
+def describe(by: Objective, cost: Cost) -> str:
     """What the other program costs, in words.
 
     Raises:

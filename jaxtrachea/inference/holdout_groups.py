@@ -11,7 +11,7 @@ from jaxtrachea.measurements.read import BadCurve, Curve
 MANY = 8
 
 
-def left_out_together(
+def with_holdout_groups(
     study: Study, groups: Iterable[Sequence[str]], unusable: Iterable[BadCurve] = ()
 ) -> Study:
     """The study with trials that no fit without one of them may see another of.
@@ -49,7 +49,7 @@ def left_out_together(
                 key=str(i),
                 cure="name trials of one specimen, or leave the group out",
             )
-    return dataclasses.replace(study, together=groups)
+    return dataclasses.replace(study, holdout_groups=groups)
 
 
 def _ensure_trial(name: str, names: Sequence[str], key: str) -> None:
@@ -63,14 +63,14 @@ def _ensure_trial(name: str, names: Sequence[str], key: str) -> None:
     )
 
 
-def companions(curves: Sequence[Curve], together: Sequence[Sequence[str]]) -> list[list[int]]:
+def companions(curves: Sequence[Curve], holdout_groups: Sequence[Sequence[str]]) -> list[list[int]]:
     """For each curve of a lane, all that are left out with it, itself among them.
 
     Args:
         curves: of a lane, of one specimen or several.
-        together: groups of trials, see `left_out_together`.
+        holdout_groups: groups of trials, see `with_holdout_groups`.
     """
-    group = {name: i for i, names in enumerate(together) for name in names}
+    group = {name: i for i, names in enumerate(holdout_groups) for name in names}
     keys = [(c.specimen, group.get(c.trial, c.trial)) for c in curves]
     members: dict[tuple[str, str | int], list[int]] = {}
     for t, key in enumerate(keys):
@@ -78,11 +78,11 @@ def companions(curves: Sequence[Curve], together: Sequence[Sequence[str]]) -> li
     return [members[key] for key in keys]
 
 
-def together_sentence(together: Sequence[Sequence[str]]) -> list[str]:
+def holdout_sentence(holdout_groups: Sequence[Sequence[str]]) -> list[str]:
     """Which trials are left out together, in words; empty if none are."""
-    if not together:
+    if not holdout_groups:
         return []
-    groups = [", ".join(group) for group in together[:MANY]]
-    if len(together) > MANY:
-        groups.append(f"{len(together) - MANY} more groups")
+    groups = [", ".join(group) for group in holdout_groups[:MANY]]
+    if len(holdout_groups) > MANY:
+        groups.append(f"{len(holdout_groups) - MANY} more groups")
     return [f"Left out together: {'; '.join(groups)}"]
