@@ -171,7 +171,7 @@ def folder(tmp_path, monkeypatch):
         lines += [f"{c.specimen},{c.trial},{c.s_c},{d!r},{f!r}" for d, f in pairs]
     (tmp_path / "data.csv").write_text("\n".join(lines) + "\n")
     free = 'force_offset = { scope = "specimen" }'
-    for name, holdout_groups, more in (
+    for name, together, more in (
         ("line", WITH, free),
         ("through", WITH, ""),
         ("alone", "", ""),
@@ -179,7 +179,7 @@ def folder(tmp_path, monkeypatch):
         ("two", 'together = [["s30", "s90"], ["s90", "s60"]]', ""),
         ("one", 'together = [["s30"]]', ""),
     ):
-        text = SPEC.format(title=name, holdout_groups=holdout_groups, more=more)
+        text = SPEC.format(title=name, together=together, more=more)
         (tmp_path / f"{name}.toml").write_text(text)
     return tmp_path
 
