@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hard_cases_page import page, skeleton
 from run_cli import run
 
 from jaxtrachea.selfcheck import table
 from jaxtrachea.selfcheck.assess import gap_of
 from jaxtrachea.selfcheck.functions import FUNCTIONS
-from jaxtrachea.selfcheck.page import page, skeleton
 from jaxtrachea.selfcheck.run import run_table
 
 CASES, TRUTHS = table.read_cases(), table.read_truth()

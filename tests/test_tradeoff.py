@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 from run_cli import run
+from tradeoff_page import choice_rows, fronts
 from tradeoff_scene import DEPTH, K_1, K_3, SCENE, TOML
 
 from jaxtrachea.config import SpecError
@@ -29,7 +30,6 @@ from jaxtrachea.tradeoff.front import pareto
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.page import choice_rows, fronts
 from jaxtrachea.tradeoff.plots import QUESTIONS, draw
 from jaxtrachea.tradeoff.trial import Trial
 

@@ -4,8 +4,9 @@ import importlib.util
 from pathlib import Path
 
 import pytest
+from tradeoff_page import read
 
-from jaxtrachea.tradeoff.page import measured, read
+from jaxtrachea.tradeoff.page import measured
 
 BENCH = Path(__file__).parent / "bench" / "tradeoff.py"
 FOLDER = Path(__file__).parents[1] / "docs" / "evidence" / "tradeoff"

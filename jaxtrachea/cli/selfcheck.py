@@ -2,6 +2,7 @@
 
 import enum
 import json
+import math
 import time
 from pathlib import Path
 from typing import Annotated
@@ -106,7 +107,6 @@ def _write(folder: Path, found, seconds, quick) -> None:
     import jax
 
     from jaxtrachea import __version__
-    from jaxtrachea.selfcheck.page import as_dict
 
     made = {
         "version": __version__,
@@ -114,7 +114,7 @@ def _write(folder: Path, found, seconds, quick) -> None:
         "device": jax.devices()[0].device_kind,
         "seconds": round(seconds, 2),
         "optimised": not quick,
-        "rows": [as_dict(o) for o in found],
+        "rows": [_plain(o) for o in found],
     }
     try:
         folder.mkdir(parents=True)
@@ -123,3 +123,29 @@ def _write(folder: Path, found, seconds, quick) -> None:
         raise Stop(
             f"{folder}: cannot be written ({error.strerror}); choose another --out"
         ) from None
+
+
+def _plain(outcome) -> dict:
+    """An outcome as plain values, errors in epsilon; what is not finite as null."""
+    value, gradient, most = outcome.value_gap, outcome.gradient_gap, outcome.tolerance
+    plain = {
+        "case": outcome.case,
+        "dtype": outcome.dtype,
+        "passed": outcome.passed,
+        "value": outcome.value,
+        "value_error": value.error,
+        "value_limit": value.limit(most.value),
+        "value_where": value.where,
+        "gradient": outcome.gradient,
+        "gradient_error": gradient.error,
+        "gradient_limit": gradient.limit(most.gradient),
+        "gradient_where": gradient.where,
+        "nans": outcome.nans,
+        "faults": list(outcome.faults),
+        "why": most.why,
+    }
+
+    def finite(v):
+        return None if isinstance(v, float) and not math.isfinite(v) else v
+
+    return {n: finite(v) for n, v in plain.items()}

@@ -17,6 +17,8 @@ from pathlib import Path
 if __name__ == "__main__":
     import common
 
+    sys.path.insert(0, str(common.FOLDER.parent / "reference"))
+
     # One thread computes, on any core; programs are compiled on all of them.
     os.sched_setaffinity(0, common.ALL_CORES)
 
@@ -41,7 +43,7 @@ LEAST = ("path", "step")
 
 def document() -> str:
     """The page that the recorded measurements give."""
-    from jaxtrachea.tradeoff.page import document as made
+    from tradeoff_page import document as made
 
     return made(FOLDER, HEAD.read_text("utf-8"))
 
@@ -118,9 +120,11 @@ def together(full, found):
 
 def scene(name: str, settings, *, only_choices: bool) -> list[dict]:
     """Measure one scene; writes its JSON lines; rows of its choices."""
+    from tradeoff_page import read
+
     from jaxtrachea.cli.tradeoff import measured_curves
     from jaxtrachea.tradeoff.measure import measure, measure_ladders
-    from jaxtrachea.tradeoff.page import lines, read
+    from jaxtrachea.tradeoff.page import lines
 
     def report(text):
         say(f"{name}: {text}")
@@ -140,7 +144,8 @@ def scene(name: str, settings, *, only_choices: bool) -> list[dict]:
 
 def pages() -> None:
     """The pictures of all scenes, and the page."""
-    from jaxtrachea.tradeoff.page import read
+    from tradeoff_page import read
+
     from jaxtrachea.tradeoff.plots import draw
 
     for name in (name for name in SCENES if (FOLDER / f"{name}.jsonl").exists()):
@@ -153,8 +158,9 @@ def pages() -> None:
 def measure_all(asked) -> None:
     """Everything asked for, a scene at a time."""
     import levels
+    from tradeoff_page import read
 
-    from jaxtrachea.tradeoff.page import lines, read
+    from jaxtrachea.tradeoff.page import lines
     from jaxtrachea.tradeoff.timing import Settings
 
     FOLDER.mkdir(exist_ok=True)
