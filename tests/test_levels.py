@@ -186,7 +186,7 @@ class Half(Level):
     observes = frozenset({"force", "joints"})
     declares = property(lambda self: self.within.declares)
     material_type = property(lambda self: self.within.material_type)
-    name = tested = property(lambda self: 0.1)
+    name = validated_depth = property(lambda self: 0.1)
 
     def needs(self, *, joints):
         return self.within.needs(joints=joints)

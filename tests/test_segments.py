@@ -109,6 +109,20 @@ def test_what_is_held():
     assert len(steps.steps) == 4
 
 
+@pytest.mark.parametrize("noise", [0.0, 2e-4, 2e-3])
+def test_a_hold_of_nearly_all_samples(noise):
+    """A ramp of 60 samples, half of them in air, then 2,000 samples of hold: one loading."""
+    rng = np.random.default_rng(3)
+    travel = np.r_[np.linspace(0, 4, 60), np.full(2000, 4.0)]
+    since = np.maximum(np.arange(2060) - 59, 0) / 100
+    force = np.maximum(travel - 2, 0) * (0.4 + 0.6 * np.exp(-since / 4))
+    found = segment(travel + noise * rng.standard_normal(2060), force, 0.01 * np.arange(2060))
+    assert (found.loadings, found.foot) == (1, 0)
+    assert abs(found.stop - 60) <= 1
+    assert found.hold.duration == pytest.approx(20, abs=0.05)
+    assert found.hold.relaxed == pytest.approx(0.6, abs=0.02)
+
+
 def test_creep_under_constant_force():
     """The tool sinks by 5 % while the force stands still: the loading ends where the force does."""
     creep = 4 + 0.2 * (1 - np.exp(-np.arange(300) / 60))

@@ -15,6 +15,8 @@ LEAST_HOLD, SLOWER, FEWEST = 0.05, 6.0, 5
 #: One that lasts less than this share of the loading counts only where its force falls by at least
 #: this share: the tool of a gentle press slows down towards its end.
 SHORT, FALLS = 0.2, 0.02
+#: One that lasts this share of the longest that counts is one of several like it, and counts too.
+ALIKE = 2 / 3
 #: Of a force that rises in proportion to the displacement, what tells slow loading from a hold.
 RISING = 0.3
 #: Shares of the loading between which its speed is taken, in so many parts.
@@ -114,7 +116,9 @@ def holds(rise: Rise) -> tuple[int, tuple[Hold, ...], Hold | None]:
     until = np.searchsorted(envelope, envelope + rise.band, side="right")
     long = rise.clock[until - 1] - rise.clock >= least
     slow = np.flatnonzero(long & (until - np.arange(size) >= FEWEST))
-    rest, steps, top = 0, [], None
+    spread = float(np.ptp(rise.force))
+    scatter = 3 * noise(rise.force) / spread if spread > 0 else 0.0
+    rest, found = 0, []
     for start, stop in _runs(slow, until):
         if envelope[start] <= envelope[0] + rise.band:
             last = _leaves(rise, envelope, start, stop, least)
@@ -127,15 +131,18 @@ def holds(rise: Rise) -> tuple[int, tuple[Hold, ...], Hold | None]:
         if last - first < FEWEST or dip > 2 * rise.band or _rises(rise, first, last):
             continue
         hold = _hold(rise, _where_force_stops(rise, first), last)
-        spread = float(np.ptp(rise.force))
-        scatter = 3 * noise(rise.force) / spread if spread > 0 else 0.0
-        if hold.duration < short and hold.relaxed < max(FALLS, scatter):
-            continue
-        if stop >= size:
-            top = hold
-        else:
-            steps.append(hold)
-    return rest, tuple(steps), top
+        found.append((hold, stop >= size))
+    sure = [h.duration >= short or h.relaxed >= max(FALLS, scatter) for h, _ in found]
+    longest = max(
+        (h.duration for (h, _), yes in zip(found, sure, strict=True) if yes), default=np.inf
+    )
+    kept = [
+        (h, at_top)
+        for (h, at_top), yes in zip(found, sure, strict=True)
+        if yes or h.duration >= ALIKE * longest
+    ]
+    steps = tuple(h for h, at_top in kept if not at_top)
+    return rest, steps, next((h for h, at_top in kept if at_top), None)
 
 
 def _durations(rise: Rise, envelope: np.ndarray) -> tuple[float, float]:

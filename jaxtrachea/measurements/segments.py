@@ -29,6 +29,8 @@ LEAST_TRAVEL = 1 / 3
 #: Share of the force range from which the tool touches, and how much farther than the contact is
 #: deep travel counts, since force grows slowly at first.
 TOUCH, FARTHER = 0.05, 1.25
+#: Parts of the way that count apart there.
+PLACES = 1000
 #: Holds on the way up from which a protocol is stepwise, and keeps them all.
 STEPS = 2
 #: A hold at the peak is one more step if it lasts at most this many times as long as they do.
@@ -146,13 +148,18 @@ def _plain(sign: int, travel: np.ndarray) -> Segments:
 
 
 def _contact(travel: np.ndarray, force: np.ndarray) -> float:
-    """Displacement from which travel counts: shortly before the tool touches."""
+    """Displacement from which travel counts: shortly before the tool touches.
+
+    A place counts once, however many samples a hold has there.
+    """
     low, high = float(force.min()), float(force.max())
-    touching = travel[force > low + TOUCH * (high - low)]
     lowest, top = float(travel.min()), float(travel.max())
-    if touching.size < FEWEST:
+    touching = np.sort(travel[force > low + TOUCH * (high - low)])
+    bins = np.floor((touching - lowest) / (top - lowest) * PLACES)
+    places = touching[np.unique(bins, return_index=True)[1]]
+    if places.size < FEWEST:
         return lowest
-    return max(lowest, top - FARTHER * (top - float(np.quantile(touching, TOUCH))))
+    return max(lowest, top - FARTHER * (top - float(np.quantile(places, TOUCH))))
 
 
 def _of_many(

@@ -49,7 +49,7 @@ class Relaxing(Level):
     hangs_on_rings = _of_inner("hangs_on_rings")
     hides_refused = _of_inner("hides_refused")
     name = _of_inner("name")
-    validated_depth = _of_inner("tested")
+    validated_depth = _of_inner("validated_depth")
     validated_angle = _of_inner("validated_angle")
     deepest = _of_inner("deepest")
     wall_radius = _of_inner("wall_radius")
