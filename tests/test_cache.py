@@ -1,9 +1,11 @@
 """Programs kept for the next start: the bounds of their folder, and the command that tells."""
 
+import atexit
 import os
 from pathlib import Path
 
 import pytest
+from jax import monitoring
 from run_cli import run
 
 from jaxtrachea.files import programs as kept
@@ -47,6 +49,21 @@ def test_bounds_are_looked_at_once_a_day(tmp_path):
     program(tmp_path, "year", 1, 365)
     assert kept.keep_bounds(tmp_path, NOW + DAY - 1) == 0
     assert kept.keep_bounds(tmp_path, NOW + DAY + 1) == 1
+
+
+def test_uses_of_the_last_command(tmp_path):
+    """Two loaded; of three compiled one is new, two were kept already: refused."""
+    assert kept.last_uses(tmp_path) is None
+    program(tmp_path, "here", 10, 1)
+    write = kept.count_uses(tmp_path)
+    for event, times in (("cache_hits", 2), ("compile_requests_use_cache", 5)):
+        for _ in range(times):
+            monitoring.record_event(f"/jax/compilation_cache/{event}")
+    program(tmp_path, "new", 10, 0)
+    program(tmp_path, "trace", 10, 0, "traced")
+    write()
+    atexit.unregister(write)
+    assert kept.last_uses(tmp_path) == (2, 3, 2)
 
 
 def test_other_files_are_no_programs(tmp_path):

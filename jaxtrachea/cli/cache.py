@@ -6,7 +6,15 @@ import typer
 from rich.console import Console
 
 from jaxtrachea.cli.terminal import Stop, cache_folder, programs_folder
-from jaxtrachea.files.programs import MOST_BYTES, MOST_DAYS, TRACED, delete, programs
+from jaxtrachea.files.programs import (
+    MOST_BYTES,
+    MOST_DAYS,
+    TRACED,
+    Uses,
+    delete,
+    last_uses,
+    programs,
+)
 
 ClearOption = Annotated[bool, typer.Option("--clear", help="Delete all that is kept.")]
 
@@ -30,4 +38,17 @@ def cache(clear: ClearOption = False) -> None:
         text += f"in {folder}"
         if folder == cache_folder():
             text += f"\nat most {MOST_BYTES // 2**20} MiB, and none unused for {MOST_DAYS:g} days"
+            uses = last_uses(folder)
+            text += "" if uses is None else f"\n{_last_run(uses)}"
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _last_run(uses: Uses) -> str:
+    """How many programs the last command loaded and compiled, and what a refusal means."""
+    text = f"the last command loaded {uses.loaded} programs and compiled {uses.compiled}"
+    if uses.refused:
+        text += (
+            f"; {uses.refused} of these were kept, but refused: damaged, or compiled with another "
+            "processor's tuning; --clear, and the next command keeps them anew"
+        )
+    return text

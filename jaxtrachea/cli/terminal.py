@@ -24,7 +24,7 @@ from rich.text import Text
 
 from jaxtrachea.cli.terminal_table import wide_table as table
 from jaxtrachea.files.pictures import sentence
-from jaxtrachea.files.programs import keep_bounds
+from jaxtrachea.files.programs import count_uses, keep_bounds
 
 __all__ = [
     "Kept", "Stages", "Stop", "cache_folder", "complain", "interrupts", "into", "programs_folder",
@@ -141,6 +141,8 @@ def set_up_jax() -> None:
     if folder is not None and "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         # Also the many small ones, which jax leaves out by itself: about a quarter of a start.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        if folder == cache_folder():
+            count_uses(folder)
 
 
 def programs_folder() -> Path | None:

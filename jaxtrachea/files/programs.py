@@ -1,9 +1,11 @@
 """Programs that are kept for the next start, compiled or traced: which, and their bounds."""
 
+import atexit
 import contextlib
+import json
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +21,8 @@ TRACED = "-traced"
 _NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED}(\.\d+(-\d+)?)?)", re.DOTALL)
 #: File whose time of change is that of the last look.
 LAST_LOOK = ".trimmed"
+#: File with the counts of the last command that computed anything.
+LAST_RUN = ".last_run.json"
 
 
 class Program(NamedTuple):
@@ -27,6 +31,53 @@ class Program(NamedTuple):
     path: Path
     size: int
     used: float
+
+
+class Uses(NamedTuple):
+    """Programs of a command: loaded, compiled, and of these refused, though they were kept.
+
+    Refused is what was damaged, or compiled with another processor's tuning.
+    """
+
+    loaded: int
+    compiled: int
+    refused: int
+
+
+def count_uses(folder: Path) -> Callable[[], None]:
+    """Count the programs of this process from here on; its end writes them into the folder.
+
+    Returns:
+        What writes the counts so far.
+    """
+    from jax import monitoring
+
+    before = {p.path.name for p in programs(folder)}
+    count = {"cache_hits": 0, "compile_requests_use_cache": 0}
+
+    def listen(event: str, **_: object) -> None:
+        name = event.rpartition("/")[2]
+        if name in count:
+            count[name] += 1
+
+    def write() -> None:
+        hits, asked = count.values()
+        if asked:
+            made = {p.path.name for p in programs(folder)} - before
+            new = sum(TRACED not in name for name in made)
+            uses = Uses(hits, asked - hits, max(asked - hits - new, 0))
+            with contextlib.suppress(OSError):
+                (folder / LAST_RUN).write_text(json.dumps(uses._asdict()))
+
+    monitoring.register_event_listener(listen)
+    return atexit.register(write)
+
+
+def last_uses(folder: Path) -> Uses | None:
+    """Those of the last command that computed anything; None: nothing is known."""
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        return Uses(**json.loads((folder / LAST_RUN).read_text()))
+    return None
 
 
 def programs(folder: Path) -> Iterator[Program]:
