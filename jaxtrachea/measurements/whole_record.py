@@ -9,9 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from jaxtrachea.measurements.curve import Fault
+from jaxtrachea.measurements.curve import Curve, Fault
 from jaxtrachea.measurements.holds import FEWEST, Hold
-from jaxtrachea.measurements.segments import Segments
+from jaxtrachea.measurements.segments import Segments, segment
 from jaxtrachea.measurements.usage import RELAXED
 
 #: Cure of a record that cannot be read with its time.
@@ -136,6 +136,24 @@ def speed_of(time: np.ndarray, displacement: np.ndarray) -> float:
     if within.size < FEWEST or not time[within[-1]] > time[within[0]]:
         return 0.0
     return float((way[within[-1]] - way[within[0]]) / (time[within[-1]] - time[within[0]]))
+
+
+def second_half_of_hold(curve: Curve) -> slice | None:
+    """Samples of the later half of the longest hold of a whole record, by time.
+
+    Of a record without a hold, all that follows its first loading. None: nothing follows, or the
+    curve is no whole record.
+    """
+    if curve.rise is None or curve.time is None:
+        return None
+    found = segment(curve.displacement, curve.force, curve.time, first=True)
+    held = [*found.steps, *(() if found.hold is None else (found.hold,))]
+    start, stop = curve.rise[1], curve.force.size
+    if held:
+        longest = max(held, key=lambda hold: hold.duration)
+        middle = curve.time[longest.start - 1] + longest.duration / 2
+        start, stop = int(np.searchsorted(curve.time, middle)), longest.stop
+    return slice(start, stop) if start < stop else None
 
 
 def block_edges(found: Segments, size: int, most: int) -> Int[np.ndarray, " b"]:
