@@ -95,10 +95,12 @@ def repeats(study: Study, leave_out: LeaveOut = "positions") -> Repeats:
 
     `speeds`: within each specimen all records whose loading has one speed.
 
-    `positions`: what each specimen repeats. Contact positions where a specimen has several (repeats of a position go together, and so do
-    positions of trials that `Study.together` names), else its trials; where all unknowns are
-    shared, a specimen of one curve as a whole. None where a stiffness belongs to a single curve: no
-    other tells of it. (Its onset and offset are fitted.)
+    `positions`: what each specimen repeats. Contact positions where it has several (repeats of a
+    position go together, and so do positions of trials that `Study.together` names), else its
+    trials; where all unknowns are shared, a specimen of one curve as a whole.
+
+    Of positions and speeds none where a stiffness belongs to a single curve: no other tells of it.
+    (Its onset and offset are fitted.)
     """
     check_word("leave_out", leave_out, LeaveOut)
     if leave_out == "holds":
