@@ -1,6 +1,5 @@
 """Relaxation at finite deflections against an arch of visco-elastic parts, solved in full."""
 
-import dataclasses
 import functools
 
 import jax.numpy as jnp

@@ -20,7 +20,7 @@ from jaxtrachea.fitting.refusals import depths
 from jaxtrachea.fitting.relaxing import span_of
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.whole_record import speed_of
+from jaxtrachea.measurements.whole_record import loading_speed
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.relaxation.laws import Span
@@ -185,10 +185,9 @@ def rates(result: FitResult, of: Whose) -> Iterator[Rate]:
         points, deepest = [], []
         for t, curve in own:
             rise = curve.rising
-            assert rise.time is not None
             depth = depths(rise.displacement, float(result.first_touch[of.lane, t]), options)
             deepest.append(float(depth.max()))
-            points.append((speed_of(rise.time, rise.displacement), float(rise.force[-1] - zero[t])))
+            points.append((loading_speed(curve), float(rise.force[-1] - zero[t])))
         depth, measured = max(deepest), np.array(points)
         alike = np.array(deepest) > 0.98 * depth
         measured = measured[alike & (measured[:, 0] > 0)]

@@ -18,7 +18,7 @@ from jaxtrachea.inference.cross_validation import refitted
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.together import companions
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.measurements.whole_record import second_half_of_hold, speed_of
+from jaxtrachea.measurements.whole_record import loading_speed, second_half_of_hold
 
 #: What is left out: see `repeats`.
 LeaveOut = Literal["positions", "speeds", "holds"]
@@ -139,19 +139,13 @@ def _later_halves(study: Study) -> Repeats:
     return Repeats(lanes, held[lanes], ("holds",) * len(lanes), scored[lanes])
 
 
-def _loading_speed(curve: Curve) -> float:
-    """Of the first loading, mm/s; 0 where there is no time."""
-    rise = curve.rising
-    return 0.0 if rise.time is None else speed_of(rise.time, rise.displacement)
-
-
 def _speeds(
     curves: tuple[Curve, ...], together: Sequence[Sequence[str]]
 ) -> Iterator[tuple[str, list[list[int]]]]:
     """As `_groups`, of specimens whose records all have a speed, by the speed."""
     twins = companions(curves, together)
     for specimen in dict.fromkeys(c.specimen for c in curves):
-        found = [(_loading_speed(c), t) for t, c in enumerate(curves) if c.specimen == specimen]
+        found = [(loading_speed(c), t) for t, c in enumerate(curves) if c.specimen == specimen]
         found.sort()
         if found[0][0] == 0:
             continue
@@ -269,7 +263,7 @@ def leave_repeats_out(
 def _place(curves: Sequence[Curve], kind: str) -> str:
     """What was left out, in words."""
     if kind == "speeds":
-        return f"{np.mean([_loading_speed(c) for c in curves]):.3g} mm/s"
+        return f"{np.mean([loading_speed(c) for c in curves]):.3g} mm/s"
     if kind != "positions":
         names = [c.specimen if kind == "specimens" else c.trial for c in curves]
         return ", ".join(dict.fromkeys(names))
