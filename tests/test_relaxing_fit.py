@@ -1,6 +1,7 @@
 """Fits of records in time: residual and Jacobian against the press, bounds, what is refused."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 from late import late
 
 from jaxtrachea.fitting import forward_residual
+from jaxtrachea.fitting.branch_times import unsampled_time
 from jaxtrachea.fitting.few_samples import serves
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
@@ -186,3 +188,39 @@ def test_a_few_samples_say_nothing_of_a_past():
     assert serves(
         dataclasses.replace(many, lanes=many.lanes._replace(time=None)), Settings(), 10_000
     )
+
+
+def times_told(word, span, **spread):
+    """What is said of each unknown of a fit of a record of so many s, of 95 % factors by name."""
+    first = curve(28.0)
+    low, high = span
+    time = np.r_[0.0, low, np.full(first.force.size - 2, high)]
+    made = dataclasses.replace(first, time=time)
+    options = dataclasses.replace(RELAXING, branches=word)
+    study = build_study([made], GEOMETRY, options)
+    names = [p.name for p, _, _ in study.unknowns[0]]
+    value = np.array([[spread.get(n, (p.value, 1))[0] for n, (p, _, _) in
+                       zip(names, study.unknowns[0], strict=True)]])  # fmt: skip
+    error = np.array([np.log(spread.get(n, (1, 1.01))[1]) / 2 for n in names])
+    result = types.SimpleNamespace(
+        study=study, theta=value, value=value,
+        uncertainty=types.SimpleNamespace(covariance=np.diag(error**2)[None], half_width=[2.0]),
+        effective=types.SimpleNamespace(growth=[1.0]),
+    )  # fmt: skip
+    return {n: unsampled_time(result, 0, i) for i, n in enumerate(names)}
+
+
+def test_strengths_are_told_where_their_times_are_sampled():
+    """The density of `fung` where its box reaches surely into the records; `power` of a decade."""
+    span = 0.1, 30.0
+    fine = times_told("fung", span, tau_1=(0.5, 1.5), tau_2=(20.0, 1.2))
+    assert set(fine.values()) == {""}
+    wide = times_told("fung", span, tau_1=(0.5, 1.5), tau_2=(60.0, 1.2))
+    assert wide["C"] == ""
+    assert wide["tau_2"].startswith("the record is shorter than tau_2")
+    for tau_1, tau_2 in (((20.0, 2.0), (60.0, 1.2)), ((0.01, 1.2), (0.15, 2.0))):
+        told = times_told("fung", span, tau_1=tau_1, tau_2=tau_2)
+        assert told["C"] == "tau_1 to tau_2 may lie beyond what the records tell, 0.1 to 30 s"
+    assert not any(times_told("power", span).values())
+    for name in ("gamma", "beta"):
+        assert "needs a decade" in times_told("power", (0.1, 0.8))[name]
