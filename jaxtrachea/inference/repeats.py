@@ -219,8 +219,9 @@ def leave_repeats_out(
         The `Missed` of all lanes.
 
     Raises:
-        ValueError: no `FitResult` or `Settings`.
+        ValueError: no `FitResult` or `Settings`, or a word that is none.
     """
+    check_word("leave_out", leave_out, LeaveOut)
     check_word("whole", whole, FitResult)
     check_word("settings", settings, Settings)
     study = whole.study
