@@ -70,7 +70,11 @@ KINDS = {
     "softening": (dataclasses.replace(RELAXING, skeleton="softening"), True),
     "bonded": (dataclasses.replace(RELAXING, contact="bonded"), True),
     "fung": (dataclasses.replace(RELAXING, branches="fung"), False),
-}
+    "parts": (dataclasses.replace(RELAXING, relaxation="parts", skeleton="softening"), True),
+    "parts, bonded": (
+        dataclasses.replace(RELAXING, relaxation="parts", contact="bonded"), False,
+    ),
+}  # fmt: skip
 
 
 def point_of(study, seed=3):
@@ -78,7 +82,9 @@ def point_of(study, seed=3):
     return jnp.asarray(guess + 0.2 * np.random.default_rng(seed).normal(size=guess.size))
 
 
-@pytest.mark.parametrize("kind", [*list(KINDS)[:3], *late(*list(KINDS)[3:])])
+@pytest.mark.parametrize(
+    "kind", [*list(KINDS)[:3], "parts", *late("bonded", "fung", "parts, bonded")]
+)
 def test_residual_is_that_of_the_press_in_time(kind):
     """In closed form beside `press_in_time` in forward mode, through lift-off."""
     options, marked = KINDS[kind]
