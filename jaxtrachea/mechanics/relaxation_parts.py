@@ -109,17 +109,15 @@ def relax_parts_with_derivatives(
         unilateral: as in `relax_parts` (static).
     """
     parts = [(*fading(time, part), part.gamma) for part in branches]
-    changes = [
+    local, skeleton = (
         # A branch that never relaxes has no change of log tau.
-        (d.gamma.T, jnp.where(d.tau == 0, 0, d.tau / part.tau[None]).T)
+        Branches(d.gamma.T, jnp.where(d.tau == 0, 0, d.tau / part.tau[None]).T)
         for d, part in zip((along.local, along.skeleton), branches, strict=True)
-    ]
-    d_law = [v for v in along.law if v is not None]
+    )
+    samples = along.displacement.T
+    along = along._replace(displacement=samples, local=local, skeleton=skeleton)
     run = _with_derivatives if unilateral else _bonded_with_derivatives
-    found, d_force, d_load = run(
-        *parts, displacement, compliance, law, *changes,
-        along.displacement.T, along.compliance, d_law,
-    )  # fmt: skip
+    found, d_force, d_load = run(*parts, displacement, compliance, law, along)
     return Parts(*found), d_force.T, d_load.T
 
 
@@ -214,9 +212,14 @@ def _after(parts, state, new, d_new):
 
 
 def _loop_with_derivatives(
-    local, skeleton, displacement, compliance, law: Law, d_local, d_skeleton, d_displacement,
-    d_compliance, d_law, unilateral: bool = True,
-):  # fmt: skip
+    local,
+    skeleton,
+    displacement,
+    compliance,
+    law: Law,
+    along: Directions,
+    unilateral: bool = True,
+):
     """`_loop`, and derivatives of force and load in K directions; lanes as there.
 
     Those of the equilibrium of a step. What several results read is stored (the barriers): XLA
@@ -228,21 +231,21 @@ def _loop_with_derivatives(
         displacement: (N, *lanes).
         compliance: of the skeleton.
         law: local law.
-        d_local: changes of gamma and of log tau, each (B, K, *lanes).
-        d_skeleton: likewise.
-        d_displacement: (N, K, *lanes).
-        d_compliance: (K, *lanes).
-        d_law: of each coefficient; (K, *lanes).
+        along: changes, of gamma and of log tau each (B, K, *lanes), of the displacement
+            (N, K, *lanes), of compliance and coefficients (K, *lanes).
         unilateral: static.
     """
     (x, lost, gamma), (x_s, lost_s, gamma_s) = local, skeleton
     barrier = jax.lax.optimization_barrier
+    d_law = list(along.law.coefficients().values())
 
     def step(state, sample):
         mine, its = state
         own, other, D, d_D = sample
-        parts, A, B, d_A, d_B = _part_with_derivatives(own, mine, gamma, *d_local)
-        parts_s, A_s, B_s, d_A_s, d_B_s = _part_with_derivatives(other, its, gamma_s, *d_skeleton)
+        parts, A, B, d_A, d_B = _part_with_derivatives(own, mine, gamma, *along.local)
+        parts_s, A_s, B_s, d_A_s, d_B_s = _part_with_derivatives(
+            other, its, gamma_s, *along.skeleton
+        )
         per = 1 / A_s
         shift, ratio = (B - B_s) * per, A * per
         solved = law.series(D - compliance * shift, compliance * ratio)
@@ -258,7 +261,7 @@ def _loop_with_derivatives(
         by_law = added(p[None] * d for p, d in zip(powers, d_law, strict=True))
         d_shift = (d_B - d_B_s - shift[None] * d_A_s) * per[None]
         d_ratio = (d_A - ratio[None] * d_A_s) * per[None]
-        pushed = d_D - d_compliance * (shift + ratio * new)[None]
+        pushed = d_D - along.compliance * (shift + ratio * new)[None]
         pushed = pushed - compliance[None] * (d_shift + d_ratio * new[None])
         softer = 1 / (1 + compliance * ratio * slope)
         d_new = (slope * softer)[None] * pushed + softer[None] * by_law
@@ -271,9 +274,9 @@ def _loop_with_derivatives(
         state = _after(parts, mine, new, d_new), _after(parts_s, its, load, d_load)
         return state, ((force, depth, load, solved.folded), d_force, d_load)
 
-    zero, none = jnp.zeros_like(displacement[0]), jnp.zeros_like(d_displacement[0])
+    zero, none = jnp.zeros_like(displacement[0]), jnp.zeros_like(along.displacement[0])
     start = tuple(((zero,) * len(g), zero, (none,) * len(g), none) for g in (gamma, gamma_s))
-    samples = (x, lost), (x_s, lost_s), displacement, d_displacement
+    samples = (x, lost), (x_s, lost_s), displacement, along.displacement
     return jax.lax.scan(step, start, samples)[1]
 
 
