@@ -125,6 +125,8 @@ TYPES = {
     "tuple[PositiveLength, PositiveLength]": ("two lengths", ""),
     "tuple[Number, Number]": ("two numbers", ""),
     "tuple[Angle, ...]": ("angles", ""),
+    "tuple[Speed, ...]": ("speeds", ""),
+    "tuple[Duration, ...]": ("durations", ""),
     "dict[str, ParameterSection]": ("table of tables", ""),
     "list[PathSection]": ("tables", ""),
 }

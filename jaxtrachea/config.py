@@ -84,6 +84,8 @@ PositiveLength = Annotated[float, quantity("length", positive=True)]
 Stress = Annotated[float, quantity("stress", positive=True)]
 Bed = Annotated[float, quantity("foundation_stiffness", positive=True)]
 Angle = Annotated[float, quantity("angle")]
+Speed = Annotated[float, quantity("velocity", positive=True)]
+Duration = Annotated[float, quantity("time")]
 Estimate = Literal["estimate"]
 PerCurve = Literal["estimate per curve"]
 ForceNoise = Annotated[
@@ -454,6 +456,14 @@ class DesignSection(Section):
     phi: tuple[Angle, ...] | None = Field(None, strict=False, min_length=1)
     """angles of the presses, each at every position and depth (`["0 deg", "60 deg"]`); none: those
     measured. Sections alone
+    """
+    speed: tuple[Speed, ...] | None = Field(None, strict=False, min_length=1)
+    """speeds of the tool (`["1 mm/s", "5 mm/s"]`), where the force relaxes; none: the slowest and
+    the fastest measured
+    """
+    hold: tuple[Duration, ...] | None = Field(None, strict=False, min_length=1)
+    """how long the tool then stays (`["0 s", "30 s"]`), each with every speed; none: the longest
+    measured
     """
 
     @model_validator(mode="after")

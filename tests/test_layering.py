@@ -90,7 +90,7 @@ WITHIN = {
         {"press"},
     ],
     "fitting": [
-        {"parameters", "lane"},
+        {"parameters", "lane", "delta_method"},
         {"model", "curve_noise"},
         {"lanes", "refusals", "relaxing"},
         {"onset", "zeros"},

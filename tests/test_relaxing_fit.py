@@ -1,6 +1,7 @@
 """Fits of records in time: residual and Jacobian against the press, bounds, what is refused."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import pytest
 from late import late
 
 from jaxtrachea.fitting import forward_residual
+from jaxtrachea.fitting.branch_times import unsampled_time
 from jaxtrachea.fitting.few_samples import serves
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
@@ -68,7 +70,11 @@ KINDS = {
     "softening": (dataclasses.replace(RELAXING, skeleton="softening"), True),
     "bonded": (dataclasses.replace(RELAXING, contact="bonded"), True),
     "fung": (dataclasses.replace(RELAXING, branches="fung"), False),
-}
+    "parts": (dataclasses.replace(RELAXING, relaxation="parts", skeleton="softening"), True),
+    "parts, bonded": (
+        dataclasses.replace(RELAXING, relaxation="parts", contact="bonded"), False,
+    ),
+}  # fmt: skip
 
 
 def point_of(study, seed=3):
@@ -76,7 +82,9 @@ def point_of(study, seed=3):
     return jnp.asarray(guess + 0.2 * np.random.default_rng(seed).normal(size=guess.size))
 
 
-@pytest.mark.parametrize("kind", [*list(KINDS)[:3], *late(*list(KINDS)[3:])])
+@pytest.mark.parametrize(
+    "kind", [*list(KINDS)[:3], "parts", *late("bonded", "fung", "parts, bonded")]
+)
 def test_residual_is_that_of_the_press_in_time(kind):
     """In closed form beside `press_in_time` in forward mode, through lift-off."""
     options, marked = KINDS[kind]
@@ -186,3 +194,39 @@ def test_a_few_samples_say_nothing_of_a_past():
     assert serves(
         dataclasses.replace(many, lanes=many.lanes._replace(time=None)), Settings(), 10_000
     )
+
+
+def times_told(word, span, **spread):
+    """What is said of each unknown of a fit of a record of so many s, of 95 % factors by name."""
+    first = curve(28.0)
+    low, high = span
+    time = np.r_[0.0, low, np.full(first.force.size - 2, high)]
+    made = dataclasses.replace(first, time=time)
+    options = dataclasses.replace(RELAXING, branches=word)
+    study = build_study([made], GEOMETRY, options)
+    names = [p.name for p, _, _ in study.unknowns[0]]
+    value = np.array([[spread.get(n, (p.value, 1))[0] for n, (p, _, _) in
+                       zip(names, study.unknowns[0], strict=True)]])  # fmt: skip
+    error = np.array([np.log(spread.get(n, (1, 1.01))[1]) / 2 for n in names])
+    result = types.SimpleNamespace(
+        study=study, theta=value, value=value,
+        uncertainty=types.SimpleNamespace(covariance=np.diag(error**2)[None], half_width=[2.0]),
+        effective=types.SimpleNamespace(growth=[1.0]),
+    )  # fmt: skip
+    return {n: unsampled_time(result, 0, i) for i, n in enumerate(names)}
+
+
+def test_strengths_are_told_where_their_times_are_sampled():
+    """The density of `fung` where its box reaches surely into the records; `power` of a decade."""
+    span = 0.1, 30.0
+    fine = times_told("fung", span, tau_1=(0.5, 1.5), tau_2=(20.0, 1.2))
+    assert set(fine.values()) == {""}
+    wide = times_told("fung", span, tau_1=(0.5, 1.5), tau_2=(60.0, 1.2))
+    assert wide["C"] == ""
+    assert wide["tau_2"].startswith("the record is shorter than tau_2")
+    for tau_1, tau_2 in (((20.0, 2.0), (60.0, 1.2)), ((0.01, 1.2), (0.15, 2.0))):
+        told = times_told("fung", span, tau_1=tau_1, tau_2=tau_2)
+        assert told["C"] == "tau_1 to tau_2 may lie beyond what the records tell, 0.1 to 30 s"
+    assert not any(times_told("power", span).values())
+    for name in ("gamma", "beta"):
+        assert "needs a decade" in times_told("power", (0.1, 0.8))[name]

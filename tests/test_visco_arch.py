@@ -8,6 +8,8 @@ import pytest
 import visco_arch
 from visco_arch import Part
 
+from jaxtrachea.fitting.refusals import too_deep_for_uniform
+from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.press import press
@@ -104,6 +106,35 @@ def test_of_a_local_law_that_takes_its_share_parts_are_as_found(law, local, skel
     given = 3.5, law, local, skeleton
     loading, hold, *_ = errors(parts(*given), *given)
     assert max(loading, hold) < most
+
+
+def test_a_fit_notes_where_uniform_errs_by_more_than_2_percent():
+    """As found against the arch, by the depth of the record and whether it has unloading."""
+    options = Options(relaxation="uniform", skeleton="softening")
+
+    def note(top, stop, options=options):
+        D = way(top)[:stop]
+        curve = Curve("s", "a", 22.0, 0.0, D, D, time=TIMES[:stop], rise=(0, 41))
+        return too_deep_for_uniform([curve], options, visco_arch.RADIUS)
+
+    for top in (1.0, 2.0, 3.5):
+        given = top, RIGID, TWO, TWO
+        loading, hold, unloading, _ = errors(parts(*given), *given)
+        assert (note(top, None) is not None) == (unloading > 0.02)
+        assert (note(top, 91) is not None) == (max(loading, hold) > 0.02)
+        plain = Options(relaxation="uniform", skeleton="sections", contact="bonded")
+        filtered = relax(
+            jnp.asarray(TIMES), jnp.asarray(visco_arch.press(TIMES, way(top), RIGID)),
+            branches(TWO), False,
+        ).force  # fmt: skip
+        loading, hold, unloading, _ = errors(filtered, *given)
+        assert (note(top, None, plain) is not None) == (unloading > 0.02)
+        assert (note(top, 91, plain) is not None) == (max(loading, hold) > 0.02)
+    text = note(2.0, None)
+    assert "by 2.6 % in unloading from 2 mm" in text
+    assert text.endswith("end the records with their holds")
+    assert note(3.5, None, Options(relaxation="parts", skeleton="softening")) is None
+    assert note(3.5, None, Options(relaxation="uniform", coupling="total")) is None
 
 
 def rows():

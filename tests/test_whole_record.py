@@ -7,6 +7,7 @@ import pytest
 
 from jaxtrachea.measurements.checks import finish
 from jaxtrachea.measurements.curve import BadCurve, Curve, RawCurve, ReadOptions
+from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.measurements.segments import segment
 from jaxtrachea.measurements.whole_record import averaged, averaged_noise, block_edges
 
@@ -109,6 +110,30 @@ def test_time_that_is_none_is_refused(changes, message):
     assert isinstance(done, BadCurve)
     assert (done.kind, message in done.message) == ("time", True)
     assert 'loading = "' in done.cure
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_two_records_of_one_trial_with_clocks_of_their_own_are_refused(tmp_path, again):
+    """A trial of its own for each is the cure, and then both are read; one sample is a mistake."""
+    raw = record()
+    table = np.stack([raw.time, raw.displacement, raw.force], axis=1)[::10]
+    if not again:
+        table[[40, 41], 0] = table[[41, 40], 0]
+
+    def read(names):
+        rows = ["specimen,trial,time [s],displacement [mm],force [N]"]
+        for name in names:
+            rows += [f"T,{name},{t:.9g},{d:.9g},{f:.9g}" for t, d, f in table]
+        (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+        return read_measurements([tmp_path / "a.csv"], dataclasses.replace(WHOLE, s="35 mm"))
+
+    (bad,) = read(["a", "a"] if again else ["a"]).bad
+    assert bad.kind == "time"
+    assert ("where a second record begins its own clock" in bad.message) == again
+    assert ("give each record a trial of its own" in bad.cure) == again
+    if again:
+        found = read(["a", "b"])
+        assert (len(found.curves), found.bad) == (2, ())
 
 
 def test_a_record_that_begins_pressed_is_refused():

@@ -1,6 +1,7 @@
 """The command compare: which of several models the same curves prefer (docs/after_a_fit.md)."""
 
 import dataclasses
+import enum
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +19,23 @@ SpecsArgument = Annotated[
     list[Path], typer.Argument(help="Two or more fit specifications of the same curves.")
 ]
 CrossOption = Annotated[
-    bool, typer.Option(help="Also predict each contact position from fits without it.")
+    bool, typer.Option(help="Also predict what is left out from fits without it.")
+]
+
+
+class _LeaveOut(enum.Enum):
+    """What --leave-out takes."""
+
+    positions = "positions"
+    speeds = "speeds"
+    holds = "holds"
+
+
+LeaveOutOption = Annotated[
+    _LeaveOut,
+    typer.Option(
+        help="What is left out: contact positions (or trials), speeds, or the second half of holds."
+    ),
 ]
 #: Specimens of a terminal table; the files hold all.
 MANY = 8
@@ -29,6 +46,7 @@ def compare(
     data: DataOption = None,
     out_dir: OutOption = None,
     cross_validation: CrossOption = True,
+    leave_out: LeaveOutOption = _LeaveOut.positions,
 ) -> None:
     """Fit the same curves by several models and rank these."""
     clock = [time.perf_counter()]
@@ -38,12 +56,15 @@ def compare(
     loaded = [load(path, data, refits=True, printed=printed) for path in specs]
     names = _names(specs, [spec.title for spec, _, _ in loaded])
     _same_data(specs, loaded, names)
+    left = leave_out.value if cross_validation else None
+    _check_leave_out(loaded, names, left)
     clock.append(time.perf_counter())
     default = Path("out") / f"{specs[0].absolute().parent.name}-compare"
     with into(out_dir, default) as (folder, stop_if_asked):
-        models = _fitted(loaded, names, cross_validation, stop_if_asked)
+        models = _fitted(loaded, names, left, stop_if_asked)
         clock.append(time.perf_counter())
-        rows, failed, sentences = _write(folder, specs, loaded, models, clock)
+        words = _left_out_words(models, leave_out.value)
+        rows, failed, sentences = _write(folder, specs, loaded, models, clock, words)
     _print(rows, sentences, failed, models, folder.parent)
     raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
 
@@ -72,7 +93,24 @@ def _same_data(specs, loaded, names) -> None:
         raise Stop(f"compare: {error}") from None
 
 
-def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
+def _check_leave_out(loaded, names, leave_out) -> None:
+    """Refuse speeds and holds that the records do not have."""
+    from jaxtrachea.inference.repeats import repeats
+
+    lacks = {
+        "speeds": "no specimen has records of two speeds with their time, or a stiffness belongs "
+        "to single curves",
+        "holds": 'no curve is a whole record with its time (loading = "record") that goes on after '
+        "its loading",
+    }
+    for (_, _, study), name in zip(loaded, names, strict=True):
+        if leave_out in lacks and not len(repeats(study, leave_out).lanes):
+            raise Stop(
+                f"compare: --leave-out {leave_out}: {name}: {lacks[leave_out]}; leave it out"
+            )
+
+
+def _fitted(loaded, names, leave_out, stop_if_asked) -> list:
     from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.fitting.fit import fit
     from jaxtrachea.inference.comparison import Model
@@ -86,14 +124,15 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
             settings = settings_of(spec)
             result = fit(study, settings, counted(name))
             left = None
-            if cross_validation:
-                left = leave_repeats_out(result, settings, counted(f"{name}, left out"))
+            if leave_out is not None:
+                told = counted(f"{name}, left out")
+                left = leave_repeats_out(result, settings, told, leave_out)
             models.append(Model(name, result, left))
         stages.close()
     return models
 
 
-def _write(folder: Path, specs, loaded, models, clock):
+def _write(folder: Path, specs, loaded, models, clock, left: str):
     """compare.csv, report.md, provenance.json; returns the rows, failed lanes and sentences."""
     import json
     from hashlib import sha256 as digest
@@ -105,9 +144,9 @@ def _write(folder: Path, specs, loaded, models, clock):
     from jaxtrachea.inference.comparison import compared
 
     rows, failed = compared(models)
-    sentences = _sentences(models, rows)
+    sentences = _sentences(rows, left)
     _table(rows).write_csv(folder / "compare.csv")
-    write_text(folder / "report.md", _report(rows, sentences, failed, models))
+    write_text(folder / "report.md", _report(rows, sentences, failed, models, left))
     ends = [*clock, time.perf_counter()]
     timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
     measured, precision = loaded[0][1], loaded[0][0].fit.precision
@@ -122,11 +161,10 @@ def _write(folder: Path, specs, loaded, models, clock):
     return rows, failed, sentences
 
 
-def _sentences(models, rows) -> dict[str, str]:
+def _sentences(rows, left: str) -> dict[str, str]:
     """Specimen to what its data prefer; the sum last."""
     from jaxtrachea.inference.comparison import sentence
 
-    left = _left_out_words(models)
     sentences = {}
     for specimen in dict.fromkeys(row.specimen for row in rows):
         own = [row for row in rows if row.specimen == specimen]
@@ -134,11 +172,11 @@ def _sentences(models, rows) -> dict[str, str]:
     return sentences
 
 
-def _left_out_words(models) -> str:
+def _left_out_words(models, leave_out) -> str:
     """What was left out, in words; "curves" if nothing was."""
     from jaxtrachea.inference.repeats import repeats
 
-    return repeats(models[0].result.study).words or "curves"
+    return repeats(models[0].result.study, leave_out).words or "curves"
 
 
 def _left_out_notes(models) -> list[str]:
@@ -194,7 +232,7 @@ def _table(rows: Iterable[Any]):
     return Table(map(dataclasses.asdict, rows), columns, title="Models")
 
 
-def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
+def _report(rows, sentences: dict[str, str], failed: int, models, left: str) -> str:
     parts = [
         "# Which model",
         "\n".join(f"- {specimen}: {text}." for specimen, text in sentences.items()),
@@ -204,7 +242,7 @@ def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
         "deflated: the same where the likelihood counts only as many samples as are independent, "
         "by the correlation of neighbouring residuals of the best model; decisive is what stays at "
         "10 or more so. weight: Akaike weight. left out: root mean square error of force of "
-        f"{_left_out_words(models)} that took no part in the fit, over the largest force; worst: "
+        f"{left} that took no part in the fit, over the largest force; worst: "
         "the largest of them by itself "
         "(docs/after_a_fit.md). All numbers: `compare.csv`.",
         *_left_out_notes(models),

@@ -72,7 +72,11 @@ def _with_depths(measurements, study, printed: set[str]):
     Nothing is fitted yet: a sought onset is taken where its curve shows it.
     """
     from jaxtrachea.fitting.onset import counted_from
-    from jaxtrachea.fitting.refusals import deeper_than_validated, mixed_in_time
+    from jaxtrachea.fitting.refusals import (
+        deeper_than_validated,
+        mixed_in_time,
+        too_deep_for_uniform,
+    )
 
     model = study.model
     curves = [c for lane in study.curves for c in lane]
@@ -81,10 +85,13 @@ def _with_depths(measurements, study, printed: set[str]):
         for row, lane in zip(study.first_touch, study.curves, strict=True)
         for d in row[: len(lane)]
     ]
-    deep = deeper_than_validated(
-        curves, model.options, float(model.geometry.radius), touch, counted_from(study.parameters)
+    options, radius = model.options, float(model.geometry.radius)
+    said = (
+        deeper_than_validated(curves, options, radius, touch, counted_from(study.parameters)),
+        too_deep_for_uniform(curves, options, radius, touch),
+        mixed_in_time(curves, options),
     )
-    notes = [n for n in (deep, mixed_in_time(curves, model.options)) if n is not None]
+    notes = [note for note in said if note is not None]
     _print("note", notes, printed)
     return dataclasses.replace(measurements, notes=(*measurements.notes, *notes))
 

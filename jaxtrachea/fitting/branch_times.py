@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.fitting.relaxing import span_of
-from jaxtrachea.relaxation.laws import LAWS, OF_SKELETON
+from jaxtrachea.relaxation.laws import LAWS, OF_SKELETON, Span
+
+#: Longest record over shortest step from which a power of time is told.
+LEAST_SPAN = 10.0
 
 
 def _product(name: str) -> tuple[str, ...]:
@@ -27,7 +30,8 @@ def unsampled_time(result: Any, lane: int, i: int) -> str:
     """Why the branch of an unknown is no estimate, in words; "": it is, or there is no branch.
 
     Its time, with the 95 % interval, has to lie between the least step of the samples and the
-    longest record.
+    longest record. The density `C` of `fung` is an estimate where times from tau_1 to tau_2 surely
+    lie there, and the numbers of `power` where the records span a decade of time.
 
     Args:
         result: the `FitResult`.
@@ -37,26 +41,44 @@ def unsampled_time(result: Any, lane: int, i: int) -> str:
     model, (unknown, specimen, trial) = result.study.model, result.study.unknowns[lane][i]
     if not model.relaxes:
         return ""
-    names = LAWS[model.options.branches].names
-    base = unknown.name.removesuffix(OF_SKELETON)
-    if base not in names or base in ("gamma", "beta", "C"):
+    base, law = unknown.name.removesuffix(OF_SKELETON), model.options.branches
+    part = unknown.name[len(base) :]
+    if base not in LAWS[law].names:
         return ""
-    whole = (unknown.name,) if model.options.branches == "fung" else _product(unknown.name)
     curves = [
         c
         for c in result.study.curves[lane]
         if c.specimen == (specimen or c.specimen) and c.trial == (trial or c.trial)
     ]
-    low, high = _interval(result, lane, whole, (specimen, trial))
     span = span_of(curves)
-    number = len(whole) if model.options.branches != "fung" else int(base[-1])
-    called = f"tau_{number}{unknown.name[len(base) :]}"
+    if law == "power":
+        if span.longest >= LEAST_SPAN * span.shortest:
+            return ""
+        return f"a power of time needs a decade; the records tell {_times(span)}"
+
+    def interval(*names):
+        return _interval(result, lane, names, (specimen, trial))
+
+    if base == "C":
+        first, last = interval(f"tau_1{part}"), interval(f"tau_2{part}")
+        if first[1] <= span.longest and last[0] >= span.shortest:
+            return ""
+        box = f"tau_1{part} to tau_2{part}"
+        return f"{box} may lie beyond what the records tell, {_times(span)}"
+    whole = (unknown.name,) if law == "fung" else _product(unknown.name)
+    low, high = interval(*whole)
+    number = len(whole) if law != "fung" else int(base[-1])
+    called = f"tau_{number}{part}"
     if high > span.longest:
         return f"the record is shorter than {called}: {span.longest:.3g} s, {called} {_to(high)}"
     if low < span.shortest:
         step = f"{span.shortest:.3g} s"
         return f"samples are further apart than {called}: {step}, {called} down to {low:.3g} s"
     return ""
+
+
+def _times(span: Span) -> str:
+    return f"{span.shortest:.3g} to {span.longest:.3g} s"
 
 
 def _to(high: float) -> str:

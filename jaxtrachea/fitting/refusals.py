@@ -20,6 +20,17 @@ from jaxtrachea.mechanics.levels.options import Options
 
 #: Causes of samples left out of a record after which its force is not that of rest.
 _REMEMBERED = ("before", "turning back", "window")
+#: Largest error of `uniform` over the peak, by depth over the radius, until the end of a hold and
+#: in unloading: of a skeleton that softens, and of the others (tests/test_visco_arch.py).
+_DEEP = (1 / 11.7, 2 / 11.7, 3.5 / 11.7)
+_ERRORS = {
+    "softening": ((0.003, 0.005, 0.009), (0.012, 0.026, 0.045)),
+    "others": ((0.008, 0.016, 0.027), (0.022, 0.044, 0.074)),
+}
+#: From this error on a note says so.
+_WORTH_A_NOTE = 0.02
+#: Share of its way by which a tool that unloads comes back.
+_UNLOADS = 0.1
 
 
 class Refusal(NamedTuple):
@@ -220,6 +231,47 @@ def mixed_in_time(curves: Sequence[Curve], options: Options) -> str | None:
     return (
         f"{whole} of {len(curves)} curves are whole records, with all of their speeds, holds and "
         "unloading: an elastic model mixes them; choose relaxation = 'uniform', or loading = 'last'"
+    )
+
+
+def too_deep_for_uniform(
+    curves: Sequence[Curve],
+    options: Options,
+    radius: float,
+    touch: Sequence[float] | None = None,
+) -> str | None:
+    """A sentence on curves so deep that `uniform` errs by more than 2 % of the peak; None: none.
+
+    The tube flattens under the tool, and its shape forgets at once what its stresses remember.
+
+    Args:
+        curves: as recorded.
+        options: of the model.
+        radius: of the tube, mm.
+        touch: displacement of each curve at first touch, mm; None: 0.
+    """
+    if options.relaxation != "uniform" or options.coupling != "series":
+        return None
+    softens = options.skeleton == "softening"
+    errors = _ERRORS["softening" if softens else "others"]
+    found = []
+    for c, at in zip(curves, [0.0] * len(curves) if touch is None else touch, strict=True):
+        depth = depths(c.displacement, at, options)
+        fall = np.max(np.maximum.accumulate(depth) - depth)
+        back = bool(fall > _UNLOADS * np.max(np.abs(depth)))
+        deep = float(np.max(np.abs(depth)))
+        found.append((float(np.interp(deep / radius, (0, *_DEEP), (0, *errors[back]))), deep, back))
+    most, deep, back = max(found)
+    if most <= _WORTH_A_NOTE:
+        return None
+    count = sum(error > _WORTH_A_NOTE for error, *_ in found)
+    cure = "end the records with their holds" if back else "press less deep"
+    cure = cure if softens else f"choose skeleton = 'softening', or {cure}"
+    return (
+        f"relaxation = 'uniform' errs by more than 2 % of the peak in {count} of {len(curves)} "
+        f"curves: by {'more than ' if deep > _DEEP[-1] * radius else ''}{100 * most:.2g} % "
+        f"{'in unloading from' if back else 'at'} {deep:.3g} mm, as an arch that flattens does "
+        f"(docs/validity.md); {cure}"
     )
 
 

@@ -6,7 +6,7 @@ Equations and derivatives are those of `relaxation.filter`.
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,12 @@ from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.press import Contact
+from jaxtrachea.mechanics.relaxation_parts import (
+    Directions,
+    relax_parts_with_derivatives,
+    way_of,
+)
 from jaxtrachea.relaxation.filter import Relaxation, relax, relax_with_derivatives
 from jaxtrachea.relaxation.laws import LAWS, OF_SKELETON, Span
 from jaxtrachea.relaxation.laws import names as names_of
@@ -183,6 +189,67 @@ def relaxed_press(
         force=force, d_force=d_force, load=relaxed.elastic, d_load=in_order(slopes.elastic),
         corner=corner,
     )  # fmt: skip
+
+
+class Way(NamedTuple):
+    """What a press follows from, with derivatives by the Jf free columns in front.
+
+    Attributes:
+        moved: of the tool after first touch, mm; (N,).
+        compliance: of the skeleton, mm/N.
+        contact: law and softening.
+    """
+
+    moved: Float[Array, "*Jf N"]
+    compliance: Float[Array, "*Jf"]
+    contact: Contact
+
+
+def parts_press(
+    model: FitModel, free: Float[Array, " Jf"], value, time, pressed: Any, way: Way, d_way: Way
+) -> Any:
+    """A press whose local law and skeleton relax apart, with its derivatives.
+
+    Args:
+        model: what is fitted (static).
+        free: free parameters, scaled coordinates.
+        value: all parameters in their units.
+        time: s.
+        pressed: `residual._Pressed` of the elastic level, of which offset and joints are taken.
+        way: of the tool, skeleton and contact.
+        d_way: their derivatives.
+    """
+
+    def branches(free) -> tuple[Branches, Branches]:
+        found = _relaxation(model, values_of(model, free, value))
+        assert found.skeleton is not None
+        return found.local, found.skeleton
+
+    def push(tangent):
+        return jax.jvp(branches, (free,), (tangent,))
+
+    parts, d_parts = jax.vmap(push, out_axes=(None, 0))(jnp.eye(len(free), dtype=free.dtype))
+    law, softening, c = way.contact.law, way.contact.softening, way.compliance
+    found, d_force, d_load = relax_parts_with_derivatives(
+        time, way.moved, c, law, parts,
+        Directions(d_way.moved, d_way.compliance, d_way.contact.law, *d_parts), _lets_go(model),
+    )  # fmt: skip
+    force, load = found.force, found.load
+
+    def bent(force, load, c, law, softening):
+        way = way_of(load, c, law)
+        folded = ~jnp.isfinite(way) | softening.past_peak(way)
+        return jnp.where(folded, jnp.nan, softening.ratio(jnp.where(folded, 0, way)) * force)
+
+    if softening is not None:
+        at = force, load, c, law, softening
+
+        def along(d_force, d_load, *changes):
+            return jax.jvp(bent, at, (d_force, d_load, *changes))
+
+        changes = d_way.compliance, d_way.contact.law, d_way.contact.softening
+        force, d_force = jax.vmap(along, out_axes=(None, 0))(d_force, d_load, *changes)
+    return pressed._replace(force=force, d_force=d_force, load=load, d_load=d_load, corner=None)
 
 
 def _lets_go(model: FitModel) -> bool:

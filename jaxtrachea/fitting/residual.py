@@ -16,11 +16,12 @@ from jaxtrachea.fitting import forward_residual
 from jaxtrachea.fitting.lane import Lane, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import SKELETON
-from jaxtrachea.fitting.relaxing import numbers, relaxed_press, relaxed_value
+from jaxtrachea.fitting.relaxing import Way, numbers, parts_press, relaxed_press, relaxed_value
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import coefficient
 from jaxtrachea.mechanics.levels.level import Closed, Motion
 from jaxtrachea.mechanics.press import Contact
+from jaxtrachea.mechanics.samples import no_history
 from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -109,7 +110,7 @@ def residual(
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    if model.level.forward:
+    if model.level.forward and not _apart(model):
         return Residual(*forward_residual.residual(model, free, of_press(lane), tube))
     skeleton, by_beam = _skeleton_and_derivative(model, free, _places(lane), tube)
 
@@ -161,6 +162,11 @@ def of_press(lane: Lane) -> Lane:
 def _beam_columns(model: FitModel) -> tuple[int, ...]:
     """Which free columns change the skeleton's compliance."""
     return tuple(i for i, p in enumerate(model.free) if p.name in SKELETON)
+
+
+def _apart(model: FitModel) -> bool:
+    """Whether local law and skeleton relax apart: the elastic press in between has no use."""
+    return model.options.relaxation == "parts"
 
 
 def _closed(model: FitModel) -> Closed:
@@ -344,7 +350,7 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
     if local.force_slope is not None:
         offset = offset + local.force_slope * D
         d_offset = d_offset + d_local.force_slope[:, None] * D[None]
-    return _Pressed(
+    pressed = _Pressed(
         force=solved.force,
         d_force=d_force,
         load=load,
@@ -354,13 +360,21 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
         d_joints=d_skeleton.joints,
         corner=corner,
     )
+    if not _apart(model):
+        return pressed
+    # Where the elastic press has no solution, none has a history from then on.
+    lost, _ = no_history(solved.status, jnp.zeros_like(D, bool))
+    moved = jnp.where(lost, jnp.nan, at(contact.onset))
+    d_moved = d_contact.onset[:, None] * by_onset[None]
+    way, d_way = Way(moved, c, contact), Way(d_moved, d_inputs["compliance"], d_contact)
+    return parts_press(model, free, value, motion.time, pressed, way, d_way)
 
 
 def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, trial: Lane):
     """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
-    motion = Motion(trial.s_c, trial.displacement, blend=trial.blend)
+    motion = Motion(trial.s_c, trial.displacement, blend=trial.blend, time=trial.time)
     pressed = _press(model, tube, free, trial.value, skeleton, by_beam, motion)
-    if trial.time is not None:
+    if trial.time is not None and not _apart(model):
         pressed = relaxed_press(model, free, trial.value, trial.time, pressed)
     joints, d_joints = None, None
     if skeleton.joints is not None and pressed.d_joints is not None:

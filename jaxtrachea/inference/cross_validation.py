@@ -150,8 +150,11 @@ def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOu
     )
 
 
-def without(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Study:
-    """The same lanes, blind to the trials held back; what these alone read is no unknown."""
+def without(study: Study, held: Bool[np.ndarray, "lanes T *n"]) -> Study:
+    """The same lanes, blind to the trials or samples held back.
+
+    What the trials that are held back as a whole alone read is no unknown.
+    """
     seen = without_data(study.lanes, held)
     own = own_unknowns(study, held)
     if own.any():
@@ -159,11 +162,12 @@ def without(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Study:
     return dataclasses.replace(study, lanes=seen)
 
 
-def own_unknowns(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Bool[np.ndarray, "lanes P"]:
-    """Unknowns of single trials that none but the trials `held` read."""
+def own_unknowns(study: Study, held: Bool[np.ndarray, "lanes T *n"]) -> Bool[np.ndarray, "lanes P"]:
+    """Unknowns of single trials that none but the trials `held` read, held as a whole."""
     own = np.zeros(study.lanes.lower.shape, bool)
+    whole = np.all(held.reshape(*held.shape[:2], -1), axis=2)
     columns = [j for j in study.free_columns if study.parameters[j].scope == "trial"]
-    for lane, trial in np.argwhere(held) if columns else ():
+    for lane, trial in np.argwhere(whole) if columns else ():
         own[lane, [i for i in study.lanes.index[lane, trial, columns] if i >= 0]] = True
     return own
 
@@ -182,7 +186,7 @@ class OwnOnset(NamedTuple):
 
 def with_own_onset(
     study: Study,
-    held: Bool[np.ndarray, "lanes T"],
+    held: Bool[np.ndarray, "lanes T *n"],
     theta: Float[np.ndarray, "lanes P"],
     settings: Settings,
 ) -> OwnOnset:
@@ -192,7 +196,7 @@ def with_own_onset(
 
     Args:
         study: the study, with all its data.
-        held: trials that took no part in the fit; at least one of each lane.
+        held: trials, or samples of them, that took no part in the fit; some of each lane.
         theta: the fit without them, scaled coordinates.
         settings: of the fit; one that does not converge keeps its best point.
     """
@@ -212,19 +216,19 @@ def with_own_onset(
 
 def refitted(
     study: Study,
-    held: Bool[np.ndarray, "lanes T"],
+    held: Bool[np.ndarray, "lanes T *n"],
     estimate: Float[np.ndarray, "lanes P"],
     settings: Settings,
     progress,
 ) -> tuple[FitResult, OwnOnset, Prediction]:
-    """Every lane fitted without the trials `held`, and what it then says of all its trials.
+    """Every lane fitted without the trials or samples `held`, and what it says of all its trials.
 
     Besides the starts of a fit one is the estimate of all data, so that no refit ends in a minimum
     which that fit has left behind (it followed up its doubts, a refit does not).
 
     Args:
         study: the study, with all its data.
-        held: trials left out.
+        held: trials left out, or samples of them; (lanes, T) or (lanes, T, N).
         estimate: of the lanes with all their data, scaled coordinates; NaN where there is none.
         settings: as for `fit`; no doubt is followed up.
         progress: as for `fit`.

@@ -5,22 +5,26 @@ intervals of the estimates are; infinite where the fit leaves open what the quan
 """
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import full_precision
+from jaxtrachea.fitting.delta_method import Estimate, standard_errors
 from jaxtrachea.fitting.force_share import offsets
 from jaxtrachea.fitting.forward_residual import answer
+from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.refusals import depths
 from jaxtrachea.fitting.relaxing import span_of
+from jaxtrachea.fitting.residual import of_trials, residual
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.whole_record import speed_of
+from jaxtrachea.measurements.whole_record import loading_speed
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.relaxation.laws import Span
@@ -28,8 +32,6 @@ from jaxtrachea.relaxation.steps import Branches
 
 #: Points a decade, decades beyond the records on either side, samples of a ramp, speeds a decade.
 POINTS, BEYOND, SAMPLES, SPEEDS = 10, 1, 60, 4
-#: Slope along a direction that the fit leaves open, over its terms, from which it counts.
-_ACTS = 1e-6
 
 
 class Band(NamedTuple):
@@ -97,29 +99,36 @@ def times(span: Span) -> Float[np.ndarray, " N"]:
     return np.logspace(low, high, int(np.ceil((high - low) * POINTS)) + 1)
 
 
-def relaxation(result: FitResult, of: Whose, at: np.ndarray, part: str) -> Band:
-    """Force of a sudden press over what lasts, at times after it, s; `part` as `branches_of`."""
+def curves(
+    result: FitResult, of: Whose, at: Float[np.ndarray, " N"], part: str
+) -> tuple[Band, Band, Band]:
+    """Force of a sudden press at times after it, s, and storage and loss at 1 / (2 pi time).
 
-    def function(free, value):
-        gamma, tau = branches_of(result.study.model, free, value, part)
-        return 1 + jnp.exp(-jnp.asarray(at)[:, None] / tau[None]) @ gamma
+    All over what lasts; `part` as `branches_of`.
+    """
+    run = program(_curves, result.study.model, part, axes=None)
+    found, errors = run(_estimate(result, of), jnp.asarray(at))
+    first, second, third = (_band(result, of.lane, *v) for v in zip(found, errors, strict=True))
+    return first, second, third
 
-    return _band(result, of, function)
+
+def _curves(model: FitModel, part: str, estimate: Estimate, time: Float[Array, " N"]):
+    """See `curves`; all three, and their standard errors; (3, N)."""
+
+    def at(free):
+        gamma, tau = branches_of(model, free, estimate.value, part)
+        x = tau[None] / time[:, None]
+        relaxed = 1 + jnp.exp(-1 / x) @ gamma
+        return jnp.stack([relaxed, 1 + 1 / (1 + 1 / (x * x)) @ gamma, 1 / (x + 1 / x) @ gamma])
+
+    return _with_errors(at, estimate)
 
 
-def moduli(result: FitResult, of: Whose, at: np.ndarray, part: str) -> tuple[Band, Band]:
-    """Storage and loss over what lasts, at frequencies, Hz."""
-
-    def function(storage: bool):
-        def of_free(free, value):
-            gamma, tau = branches_of(result.study.model, free, value, part)
-            x = 2 * jnp.pi * jnp.asarray(at)[:, None] * tau[None]
-            share = 1 / (1 + 1 / (x * x)) if storage else 1 / (x + 1 / x)
-            return (1.0 if storage else 0.0) + share @ gamma
-
-        return _band(result, of, of_free)
-
-    return function(True), function(False)
+def _with_errors(function: Callable[[Array], Float[Array, "*n"]], estimate: Estimate):
+    """A quantity of the free columns, and its standard errors."""
+    slope = jnp.moveaxis(jax.jacfwd(function)(estimate.free), -1, 0)
+    errors = standard_errors(slope, estimate.covariance, estimate.null_space)
+    return function(estimate.free), errors
 
 
 def branches_of(model: FitModel, free, value, part: str) -> Branches:
@@ -137,58 +146,47 @@ def parts_of(result: FitResult) -> tuple[str, ...]:
     return ("local", "skeleton") if apart else ("all",)
 
 
-def _estimate(result: FitResult, of: Whose):
-    """Free columns of a new press, with all parameters in their units; 0 for those of a press."""
-    study = result.study
-    known = of.index >= 0
-    free = np.where(known, result.theta[of.lane][np.maximum(of.index, 0)], 0.0)
+def _estimate(result: FitResult, of: Whose) -> Estimate:
+    """What the fit knows of the free columns of a new press; 0 for those of a press."""
+    study, u = result.study, result.uncertainty
+    known, index = of.index >= 0, np.maximum(of.index, 0)
     value = np.array([0.0 if p.name in OF_THE_PRESS else p.value for p in study.parameters])
-    return jnp.asarray(free), jnp.asarray(value)
+    both = known[:, None] & known
+    return Estimate(
+        free=jnp.asarray(np.where(known, result.theta[of.lane][index], 0.0)),
+        value=jnp.asarray(value),
+        covariance=jnp.asarray(np.where(both, u.covariance[of.lane][np.ix_(index, index)], 0.0)),
+        null_space=jnp.asarray(np.where(known, u.null_space[of.lane][:, index], 0.0)),
+        half_width=jnp.asarray(u.half_width[of.lane]),
+    )
 
 
-def _band(result: FitResult, of: Whose, function: Callable[..., Float[Array, " N"]]) -> Band:
-    """A quantity of the free columns with its band."""
-    free, value = _estimate(result, of)
-    found = np.asarray(function(free, value))
-    slope = np.zeros((len(free), len(found)))
-    if len(free):
-        slope = np.asarray(jax.jacfwd(lambda free: function(free, value))(free)).T
-    return _with_slope(result, of, found, slope)
-
-
-def _with_slope(result: FitResult, of: Whose, found: np.ndarray, slope: np.ndarray) -> Band:
-    """The band of a quantity with its derivative by the free columns, (F, N)."""
-    known, u = of.index >= 0, result.uncertainty
-    index = of.index[known]
-    slope = slope[known]
-    variance = np.einsum("fn,fg,gn->n", slope, u.covariance[of.lane][np.ix_(index, index)], slope)
-    null = u.null_space[of.lane][:, index]
-    acts = np.abs(null @ slope) > _ACTS * (np.abs(null) @ np.abs(slope))
-    half = float(u.half_width[of.lane] * result.effective.growth[of.lane])
+def _band(result: FitResult, lane: int, value: Any, error: Any) -> Band:
+    """The 95 % band of a quantity with its standard error, widened as intervals are."""
+    value, error = np.asarray(value), np.asarray(error)
+    half = float(result.uncertainty.half_width[lane] * result.effective.growth[lane])
     with np.errstate(invalid="ignore"):
-        wide = half * np.sqrt(np.maximum(variance, 0))
-    wide = np.where(acts.any(axis=0), np.inf, wide)
-    return Band(found, found - wide, found + wide)
+        wide = half * error
+    return Band(value, value - wide, value + wide)
 
 
 def rates(result: FitResult, of: Whose) -> Iterator[Rate]:
     """Force at the largest depth of each position against the speed of the ramp there."""
     study = result.study
-    options, run = study.model.options, program(_ramp, study.model, axes=(None, None, None, 0))
+    options, run = study.model.options, program(_ramp, study.model, axes=(None, None, 0))
     places: dict[float, list[tuple[int, Curve]]] = {}
     for t, curve in of.curves:
         if curve.phi_c == 0 and tuple(curve.direction) == (1.0, 0.0):
             places.setdefault(np.nan if curve.s_c is None else curve.s_c, []).append((t, curve))
-    free, value = _estimate(result, of)
+    estimate = _estimate(result, of)
     zero = offsets(study, result.theta)[of.lane]
     for s, own in places.items():
         points, deepest = [], []
         for t, curve in own:
             rise = curve.rising
-            assert rise.time is not None
             depth = depths(rise.displacement, float(result.first_touch[of.lane, t]), options)
             deepest.append(float(depth.max()))
-            points.append((speed_of(rise.time, rise.displacement), float(rise.force[-1] - zero[t])))
+            points.append((loading_speed(curve), float(rise.force[-1] - zero[t])))
         depth, measured = max(deepest), np.array(points)
         alike = np.array(deepest) > 0.98 * depth
         measured = measured[alike & (measured[:, 0] > 0)]
@@ -197,21 +195,20 @@ def rates(result: FitResult, of: Whose) -> Iterator[Rate]:
         low, high = np.log10(measured[:, 0].min()) - 1, np.log10(measured[:, 0].max()) + 1
         speed = np.logspace(low, high, int(np.ceil((high - low) * SPEEDS)) + 1)
         at = float(study.model.geometry.length) / 2 if np.isnan(s) else s
-        found, slope = run(free, value, jnp.asarray([at, depth]), jnp.asarray(speed))
-        band = _with_slope(result, of, np.asarray(found), np.asarray(slope).T)
-        yield Rate(s, depth, speed, band, measured)
+        found = run(estimate, jnp.asarray([at, depth]), jnp.asarray(speed))
+        yield Rate(s, depth, speed, _band(result, of.lane, *found), measured)
 
 
-def _ramp(model: FitModel, free, value, where, speed):
-    """Force at the end of a ramp of one speed, and its derivative by the free columns."""
-    displacement = where[1] * jnp.linspace(0, 1, SAMPLES, dtype=free.dtype)
-    tube = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
+def _ramp(model: FitModel, estimate: Estimate, where, speed):
+    """Force at the end of a ramp of one speed, and its standard error."""
+    displacement = where[1] * jnp.linspace(0, 1, SAMPLES, dtype=speed.dtype)
+    tube = jax.tree.map(lambda v: jnp.asarray(v, speed.dtype), model.geometry)
     motion = Motion(where[0], displacement, time=displacement / speed)
 
     def at(free):
-        return answer(model, free, value, motion, tube).force[-1]
+        return answer(model, free, estimate.value, motion, tube).force[-1]
 
-    return at(free), jax.jacfwd(at)(free)
+    return _with_errors(at, estimate)
 
 
 class Loop(NamedTuple):
@@ -221,21 +218,55 @@ class Loop(NamedTuple):
         specimen: name.
         trial: name.
         s: mm; NaN without one.
+        speed: of its loading, mm/s; 0: not known.
         measured: integral of the measured force over the way.
         model: of that of the model.
+        low: end of its 95 % band, of the parameters.
+        high: likewise.
     """
 
     specimen: str
     trial: str
     s: float
+    speed: float
     measured: float
     model: float
+    low: float
+    high: float
 
 
 def loops(result: FitResult, of: Whose) -> Iterator[Loop]:
     """Of every record: what its loop encloses, and of one without unloading its work."""
+    study, u = result.study, result.uncertainty
+    way = np.zeros(study.lanes.force.shape[1:])  # weights of the trapezoidal rule
     for t, c in of.curves:
-        model = c.force + result.residuals.force[of.lane, t, : len(c.force)]
-        way = np.diff(c.displacement)
-        work = (float(way @ (force[1:] + force[:-1])) / 2 for force in (c.force, model))
-        yield Loop(c.specimen, c.trial, np.nan if c.s_c is None else c.s_c, *work)
+        step = np.diff(c.displacement) / 2
+        way[t, : len(c.force)] = np.append(step, 0) + np.insert(step, 0, 0)
+    lane = jax.tree.map(lambda v: jnp.asarray(v[of.lane]), study.lanes)
+    estimate = Estimate(
+        jnp.asarray(result.theta[of.lane]), lane.value, jnp.asarray(u.covariance[of.lane]),
+        jnp.asarray(u.null_space[of.lane]), jnp.asarray(u.half_width[of.lane]),
+    )  # fmt: skip
+    work, error = program(_work, study.model, axes=None)(estimate, lane, jnp.asarray(way))
+    band = _band(result, of.lane, work, error)
+    for t, c in of.curves:
+        measured = float(way[t, : len(c.force)] @ c.force)
+        s = np.nan if c.s_c is None else c.s_c
+        ends = (float(v[t]) for v in band)
+        yield Loop(c.specimen, c.trial, s, loading_speed(c), measured, *ends)
+
+
+@full_precision
+def _work(model: FitModel, estimate: Estimate, lane: Lane, way: Float[Array, "T N"]):
+    """Work of every trial of a lane, N mm, and its standard error; (T,)."""
+    found, samples = residual(model, estimate.free, lane), lane.force.shape[1]
+    weight = jnp.where(
+        lane.precision > 0, way / jnp.where(lane.precision > 0, lane.precision, 1), 0
+    )
+    off = jnp.sum(weight * found.value[:, :samples], axis=1)
+    by_column = jnp.einsum("tn,tjn->tj", weight, found.jacobian[:, :, :samples])
+    unit = jnp.eye(estimate.free.shape[0], dtype=way.dtype)
+    reads = jax.vmap(lambda v: of_trials(model, v, lane))(unit)  # (P, T, Jf)
+    slope = jnp.einsum("tj,ptj->pt", by_column, reads)
+    work = jnp.sum(way * lane.force, axis=1) + off
+    return work, standard_errors(slope, estimate.covariance, estimate.null_space)

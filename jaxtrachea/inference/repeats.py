@@ -1,7 +1,10 @@
-"""Leaving out all curves of a position, or of a trial: what a model says of places not seen."""
+"""Leaving out all curves of a position, a trial, a speed, or what comes later in each record.
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+What a model says of places, speeds and times that it has not seen.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +18,20 @@ from jaxtrachea.inference.cross_validation import refitted
 from jaxtrachea.inference.holdout_groups import companions
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.whole_record import loading_speed, second_half_of_hold
+
+#: What is left out: see `repeats`.
+LeaveOut = Literal["positions", "speeds", "holds"]
+#: Ramps whose speeds differ by less than this factor have one speed.
+_ONE_SPEED = 1.2
+#: What is left out, in words and in the order of reports, by the kind of its groups.
+_WORDS = {
+    "positions": "positions",
+    "trials": "trials",
+    "specimens": "specimens",
+    "speeds": "speeds",
+    "holds": "the second half of holds",
+}
 
 
 class Worst(NamedTuple):
@@ -22,7 +39,7 @@ class Worst(NamedTuple):
 
     Attributes:
         error: root mean square force residual of its curves, over the lane's largest force.
-        place: in words: contact position with its angle, trial or specimen.
+        place: in words: contact position with its angle, speed, trial or specimen.
     """
 
     error: float
@@ -54,45 +71,93 @@ class Repeats(NamedTuple):
 
     Attributes:
         lanes: whose; (rows,).
-        held: which trials; (rows, T).
-        kinds: `positions`, `trials` or `specimens`; (rows,).
+        held: which trials; (rows, T). With `holds` which samples; (rows, T, N).
+        kinds: `positions`, `trials`, `specimens`, `speeds` or `holds`; (rows,).
+        scored: which of those that are held are predicted; as `held`.
     """
 
     lanes: Int[np.ndarray, " rows"]
-    held: Bool[np.ndarray, "rows T"]
+    held: Bool[np.ndarray, "rows T *n"]
     kinds: tuple[str, ...]
+    scored: Bool[np.ndarray, "rows T *n"]
 
     @property
     def words(self) -> str:
         """What is left out, in words."""
-        order = ("positions", "trials", "specimens")
-        return " and ".join(kind for kind in order if kind in self.kinds)
+        return " and ".join(word for kind, word in _WORDS.items() if kind in self.kinds)
 
 
-def repeats(study: Study) -> Repeats:
-    """What each specimen repeats, within every lane.
+def repeats(study: Study, leave_out: LeaveOut = "positions") -> Repeats:
+    """What can be left out of every lane.
 
-    Contact positions where a specimen has several (repeats of a position go together, and so do
-    positions of trials that `Study.together` names), else its trials; where all unknowns are
-    shared, a specimen of one curve as a whole. None where a stiffness belongs to a single curve: no
-    other tells of it. (Its onset and offset are fitted.)
+    `holds`: of all records of a lane at once, what follows the middle of the longest hold; its
+    second half is predicted. Of a record without a hold all after its loading.
+
+    `speeds`: within each specimen all records whose loading has one speed.
+
+    `positions`: what each specimen repeats. Contact positions where it has several (repeats of a
+    position go together, and so do positions of trials that `Study.together` names), else its
+    trials; where all unknowns are shared, a specimen of one curve as a whole.
+
+    Of positions and speeds none where a stiffness belongs to a single curve: no other tells of it.
+    (Its onset and offset are fitted.)
     """
+    check_word("leave_out", leave_out, LeaveOut)
+    if leave_out == "holds":
+        return _later_halves(study)
     free = [p for p in study.parameters if not p.fixed]
     width = study.lanes.s_c.shape[1]
     lanes, held, kinds = [], [], []
     own = any(p.scope == "trial" and p.name not in OF_THE_PRESS for p in free)
     shared = all(p.scope == "shared" or p.name in OF_THE_PRESS for p in free)
     for lane, curves in enumerate(() if own else study.curves):
-        for kind, groups in _groups(curves, study.holdout_groups, shared=shared):
+        found = _groups(curves, study.holdout_groups, shared=shared)
+        if leave_out == "speeds":
+            found = _speeds(curves, study.holdout_groups)
+        for kind, groups in found:
             for group in groups:
                 row = np.zeros(width, bool)
                 row[group] = True
                 lanes.append(lane)
                 held.append(row)
                 kinds.append(kind)
-    return Repeats(
-        np.array(lanes, int), np.array(held, bool).reshape(len(held), width), tuple(kinds)
-    )
+    rows = np.array(held, bool).reshape(len(held), width)
+    return Repeats(np.array(lanes, int), rows, tuple(kinds), rows)
+
+
+def _later_halves(study: Study) -> Repeats:
+    """`repeats` by time: one row for every lane that has a whole record."""
+    held = np.zeros(study.lanes.force.shape, bool)
+    scored = held.copy()
+    for lane, curves in enumerate(study.curves):
+        for t, curve in enumerate(curves):
+            later = second_half_of_hold(curve)
+            if later is not None:
+                held[lane, t, later.start :] = True
+                scored[lane, t, later] = True
+    lanes = np.flatnonzero(held.any(axis=(1, 2)))
+    return Repeats(lanes, held[lanes], ("holds",) * len(lanes), scored[lanes])
+
+
+def _speeds(
+    curves: tuple[Curve, ...], holdout_groups: Sequence[Sequence[str]]
+) -> Iterator[tuple[str, list[list[int]]]]:
+    """As `_groups`, of specimens whose records all have a speed, by the speed."""
+    twins = companions(curves, holdout_groups)
+    for specimen in dict.fromkeys(c.specimen for c in curves):
+        found = [(loading_speed(c), t) for t, c in enumerate(curves) if c.specimen == specimen]
+        found.sort()
+        if found[0][0] == 0:
+            continue
+        parts = [[found[0][1]]]
+        for (before, _), (speed, t) in zip(found[:-1], found[1:], strict=True):
+            if speed < _ONE_SPEED * before:
+                parts[-1].append(t)
+            else:
+                parts.append([t])
+        parts = _merged(parts, twins)
+        if len(parts) > 1:
+            yield "speeds", parts
 
 
 def _groups(
@@ -133,9 +198,12 @@ def _merged(parts: list[list[int]], twins: list[list[int]]) -> list[list[int]]:
 
 
 def leave_repeats_out(
-    whole: FitResult, settings: Settings, progress: Callable[[int, int], None] | None = None
+    whole: FitResult,
+    settings: Settings,
+    progress: Callable[[int, int], None] | None = None,
+    leave_out: LeaveOut = "positions",
 ) -> Missed:
-    """Fit every lane without each of its `repeats` and predict the curves left out.
+    """Fit every lane without each of its `repeats` and predict what is left out.
 
     The onset and the force offset of a curve left out are fitted to it, all else kept. A refit that
     does not converge predicts from its best point, and is counted: to leave it out would spare a
@@ -145,25 +213,28 @@ def leave_repeats_out(
         whole: the fit of all curves.
         settings: as for `fit`; every refit also starts from the estimate of the whole fit.
         progress: as for `fit`.
+        leave_out: see `repeats`.
 
     Returns:
         The `Missed` of all lanes.
 
     Raises:
-        ValueError: no `FitResult` or `Settings`.
+        ValueError: no `FitResult` or `Settings`, or a word that is none.
     """
+    check_word("leave_out", leave_out, LeaveOut)
     check_word("whole", whole, FitResult)
     check_word("settings", settings, Settings)
     study = whole.study
     count = len(study.curves)
-    lanes, held, kinds = repeats(study)
+    lanes, held, kinds, scored = repeats(study, leave_out)
     if not len(lanes):
         none = np.zeros(count, int)
         return Missed(np.full(count, np.nan), none, none, none)
     chosen = study.take(lanes)
     result, touched, seen = refitted(chosen, held, whole.theta[lanes], settings, progress)
     seen = seen.force
-    observed = held[:, :, None] & (chosen.lanes.precision > 0)
+    predicted = scored.reshape(*scored.shape[:2], -1)
+    observed = predicted & (chosen.lanes.precision > 0)
     lost = np.any(observed & ~np.isfinite(seen), axis=(1, 2))
     converged = result.succeeded & touched.converged
 
@@ -181,17 +252,21 @@ def leave_repeats_out(
         rows = np.flatnonzero(lanes == lane)
         peak = np.max(np.abs(study.lanes.force[lane]))
         missed.error[lane] = float(rms(seen[rows][observed[rows]])) / peak
-        each = [float(rms(seen[row][observed[row]])) / peak for row in rows]
-        row = rows[int(np.argmax(each))]
-        curves = [study.curves[lane][t] for t in np.flatnonzero(held[row])]
-        worst[lane] = Worst(max(each), _place(curves, kinds[row]))
+        parts = [(row, np.flatnonzero(observed[row].any(axis=1)).tolist()) for row in rows]
+        if leave_out == "holds":  # each record is a part
+            parts = [(row, [t]) for row, trials in parts for t in trials]
+        each = [float(rms(seen[row, t][observed[row, t]])) / peak for row, t in parts]
+        row, trials = parts[int(np.argmax(each))]
+        worst[lane] = Worst(max(each), _place([study.curves[lane][t] for t in trials], kinds[row]))
     return missed._replace(worst=tuple(worst))
 
 
 def _place(curves: Sequence[Curve], kind: str) -> str:
     """What was left out, in words."""
+    if kind == "speeds":
+        return f"{np.mean([loading_speed(c) for c in curves]):.3g} mm/s"
     if kind != "positions":
-        names = [c.trial if kind == "trials" else c.specimen for c in curves]
+        names = [c.specimen if kind == "specimens" else c.trial for c in curves]
         return ", ".join(dict.fromkeys(names))
     words = []
     for c in curves:

@@ -64,11 +64,15 @@ def _check_time(raw: RawCurve, time: np.ndarray | None) -> None:
     back = np.flatnonzero(time[1:] < time[:-1])
     if back.size:
         at = int(back[0]) + 1
+        again, cure = "", "put the samples in order"
+        if time[at] <= time[1]:
+            again = ", where a second record begins its own clock"
+            cure = "give each record a trial of its own, put the samples in order"
         raise Fault(
             "time",
             f"time falls from {time[at - 1]:.6g} to {time[at]:.6g} s in"
-            f" {raw.row_word} {raw.rows[at]}",
-            'put the samples in order, or use loading = "all", which needs none',
+            f" {raw.row_word} {raw.rows[at]}{again}",
+            f'{cure}, or use loading = "all", which needs none',
         )
 
 

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from jaxtrachea.measurements.curve import Fault
+from jaxtrachea.measurements.curve import Curve, Fault
 from jaxtrachea.measurements.holds import FEWEST, Hold
-from jaxtrachea.measurements.segments import Segments
+from jaxtrachea.measurements.segments import Segments, segment
 from jaxtrachea.measurements.usage import RELAXED
 
 #: Cure of a record that cannot be read with its time.
@@ -136,6 +136,36 @@ def speed_of(time: np.ndarray, displacement: np.ndarray) -> float:
     if within.size < FEWEST or not time[within[-1]] > time[within[0]]:
         return 0.0
     return float((way[within[-1]] - way[within[0]]) / (time[within[-1]] - time[within[0]]))
+
+
+def longest_hold(curve: Curve) -> Hold | None:
+    """Of a whole record; None: it has none, or the curve is no whole record."""
+    if curve.rise is None or curve.time is None:
+        return None
+    found = segment(curve.displacement, curve.force, curve.time, first=True)
+    held = (*found.steps, *(() if found.hold is None else (found.hold,)))
+    return max(held, key=lambda hold: hold.duration, default=None)
+
+
+def second_half_of_hold(curve: Curve) -> slice | None:
+    """Samples of the later half of the longest hold of a whole record, by time.
+
+    Of a record without a hold, all that follows its first loading. None: nothing follows, or the
+    curve is no whole record.
+    """
+    if curve.rise is None or curve.time is None:
+        return None
+    start, stop = curve.rise[1], curve.force.size
+    if (hold := longest_hold(curve)) is not None:
+        middle = curve.time[hold.start - 1] + hold.duration / 2
+        start, stop = int(np.searchsorted(curve.time, middle)), hold.stop
+    return slice(start, stop) if start < stop else None
+
+
+def loading_speed(curve: Curve) -> float:
+    """Speed of the first loading, mm/s, as `speed_of`; 0 where there is no time."""
+    rise = curve.rising
+    return 0.0 if rise.time is None else speed_of(rise.time, rise.displacement)
 
 
 def block_edges(found: Segments, size: int, most: int) -> Int[np.ndarray, " b"]:

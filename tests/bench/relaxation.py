@@ -16,7 +16,11 @@ import numpy as np
 
 from jaxtrachea.mechanics.equilibrium import press_series, sensitivity
 from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.relaxation_parts import relax_parts
+from jaxtrachea.mechanics.relaxation_parts import (
+    Directions,
+    relax_parts,
+    relax_parts_with_derivatives,
+)
 from jaxtrachea.relaxation import laws as relaxation_laws
 from jaxtrachea.relaxation.filter import relax, relax_with_derivatives
 from jaxtrachea.relaxation.laws import Span
@@ -67,6 +71,15 @@ def cases(quintic: bool) -> dict:
         _, c, law = elastic(theta, D, quintic)
         return relax_parts(time, D, c, law, branches(theta), branches(theta)).force
 
+    def parts_jacobian(theta, D, time):
+        def read(theta):
+            _, c, law = elastic(theta, D, quintic)
+            return D, c, law, branches(theta), branches(theta)
+
+        along = jax.vmap(lambda e: jax.jvp(read, (theta,), (e,))[1])(jnp.eye(theta.size))
+        _, c, law, *both = read(theta)
+        return relax_parts_with_derivatives(time, D, c, law, tuple(both), Directions(*along))[1]
+
     def power(theta, D, time):
         given = {"gamma": jnp.exp(theta[4]), "beta": jnp.exp(theta[6]) / 2}
         made = relaxation_laws.branches("power", given, SPAN)
@@ -80,6 +93,7 @@ def cases(quintic: bool) -> dict:
         "uniform, 2 branches, bonded": lambda *v: uniform(*v, unilateral=False),
         "J elastic": jacobian,
         "J uniform, 2 branches": uniform_jacobian,
+        "J parts, 2 + 2 branches": parts_jacobian,
     }
 
 

@@ -15,6 +15,7 @@ import jaxtrachea
 from jaxtrachea.cli.main import main
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
+from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import assess
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
@@ -217,6 +218,29 @@ def test_the_work_of_each_record_is_that_of_the_model(fitted):
         work = np.sum((force[1:] + force[:-1]) / 2) * 2 / 2000
         assert float(row["measured [N mm]"]) == pytest.approx(work, rel=0.01)
         assert float(row["model [N mm]"]) == pytest.approx(work, rel=0.005)
+        low, high = (float(row[f"model_{end} [N mm]"]) for end in ("low95", "high95"))
+        assert low < work < high
+    assert (fitted / "out" / "energy.png").exists()
+
+
+def test_the_band_of_the_work_is_that_of_differences(read, fitted):
+    """The delta method by numpy: derivatives of the model's work by central differences."""
+    study, h = read.study, 1e-5
+
+    def work(theta):
+        off = predictions(study, theta[None]).force[0]
+        rows = zip(study.curves[0], off, strict=False)
+        return np.array([np.trapezoid(c.force + v[: len(c.force)], c.displacement)
+                         for c, v in rows])  # fmt: skip
+
+    theta = read.theta[0]
+    step = h * np.eye(len(theta))
+    J = np.stack([(work(theta + e) - work(theta - e)) / (2 * h) for e in step])
+    se = np.sqrt(np.einsum("pt,pq,qt->t", J, read.uncertainty.covariance[0], J))
+    half = read.uncertainty.half_width[0] * read.effective.growth[0] * se
+    rows = table_of(fitted / "out" / "energy.csv")
+    wide = column(rows, "model_high95 [N mm]") - column(rows, "model_low95 [N mm]")
+    np.testing.assert_allclose(wide, 2 * half, rtol=1e-4)
 
 
 REFUSED = {

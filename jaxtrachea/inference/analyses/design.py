@@ -19,6 +19,7 @@ from jaxtrachea.inference.analysis import (
 )
 from jaxtrachea.inference.design.candidates import (
     Candidates,
+    beyond_records,
     candidates_of,
     extrapolation,
     pressed_specimen,
@@ -73,10 +74,17 @@ def _compute(request: Request, findings: AnalysisResults, progress: Progress) ->
     choice = next_points(known, at, section.points, section.criterion, added)
     s = np.linspace(at.s.min(), at.s.max(), 121)
     angles = [0.0] if at.phi is None else np.unique(at.phi).tolist()
-    curve = 0 if at.curve is None else int(at.curve[choice.chosen[0]])
-    deepest = float(at.depth.max())
-    charts = [identifiability(known, s, deepest, phi, curve) for phi in angles]
+    first, deepest = int(choice.chosen[0]), float(at.depth.max())
+    curve = 0 if at.curve is None else int(at.curve[first])
+    charts = [identifiability(known, s, deepest, phi, curve, _pace(at, first)) for phi in angles]
     return Design(known, at, added, choice, charts, names(known, findings.result))
+
+
+def _pace(at: Candidates, k: int) -> tuple[float, float] | None:
+    """Speed, mm/s, and hold, s, of a candidate; None: the force knows no time."""
+    if at.speed is None or at.hold is None:
+        return None
+    return float(at.speed[k]), float(at.hold[k])
 
 
 def names(known: Situation, result) -> list[str]:
@@ -96,7 +104,12 @@ def choice_rows(found: Design) -> Iterator[dict[str, object]]:
         place = place if step else dict.fromkeys(place)
         pairs = zip(found.unknowns, error, strict=False)
         errors = {f"{name} relative se": float(e) for name, e in pairs}
-        message = extrapolation(study, float(at.depth[k]), found.known.reach) if step else ""
+        message, pace = "", _pace(at, k)
+        if step:
+            depth = float(at.depth[k])
+            said = [extrapolation(study, depth, found.known.reach)]
+            said += [] if pace is None else [beyond_records(study, *pace, depth)]
+            message = "; ".join(filter(None, said))
         yield {"press": step, **place, **errors, "message": message}
 
 
@@ -107,10 +120,13 @@ def _specimens(study: Study, at: Candidates) -> dict[int, str]:
 
 
 def _place(at: Candidates, k: int, names: dict[int, str]) -> dict[str, object]:
-    """Where a candidate is, on which specimen; its angle only where some candidate has one."""
+    """Where a candidate is, on which specimen; angle, speed and hold where candidates have one."""
     turned = {} if at.phi is None else {"phi_deg": float(np.degrees(at.phi[k]))}
     specimen = names[0 if at.curve is None else int(at.curve[k])]
-    return {"specimen": specimen, "s_mm": float(at.s[k]), **turned, "depth_mm": float(at.depth[k])}
+    pace = _pace(at, k)
+    timed = {} if pace is None else dict(zip(("speed_mm_s", "hold_s"), pace, strict=True))
+    place = {"specimen": specimen, "s_mm": float(at.s[k]), **turned}
+    return {**place, "depth_mm": float(at.depth[k]), **timed}
 
 
 def candidate_rows(known: Situation, added: np.ndarray, at: Candidates) -> Iterator[Cells]:
@@ -160,6 +176,7 @@ def _table(found: Design, lanes: list[int]) -> Table:
     """The presses that were chosen, and the errors expected after each."""
     rows = list(choice_rows(found))
     heads = {"s_mm": "s [mm]", "phi_deg": "phi [deg]", "depth_mm": "depth [mm]"}
+    heads |= {"speed_mm_s": "speed [mm/s]", "hold_s": "hold [s]"}
     columns = [
         Column(heads.get(name, name.removesuffix(" relative se")), name, digits=3, null="")
         for name in rows[0]
@@ -201,20 +218,24 @@ def draw_design(design: Design):
     middle.set(xlabel="s [mm]", ylabel="s [mm]", title=f"two presses, no other data{where}")
     angles = np.zeros(len(at.s)) if at.phi is None else at.phi
     curves = np.zeros(len(at.s), int) if at.curve is None else at.curve
-    # Of many specimens those that are pressed.
-    pressed = np.isin(curves, curves[choice.chosen])
-    keys = zip(curves[pressed].tolist(), angles[pressed].tolist(), at.depth[pressed].tolist(),
-               strict=True)  # fmt: skip
-    for curve, phi, depth in sorted(set(keys)):
-        own = (at.depth == depth) & (angles == phi) & (curves == curve)
+    none = np.zeros(len(at.s))
+    speeds, holds = (none if v is None else v for v in (at.speed, at.hold))
+    # Of many specimens, and speeds with holds, those that are pressed.
+    table = np.stack([curves, speeds, holds, angles, at.depth], axis=1)
+    pressed = (table[:, None, :3] == table[choice.chosen, :3]).all(axis=2).any(axis=1)
+    for row in np.unique(table[pressed], axis=0):
+        own, (curve, speed, hold, phi, depth) = (table == row).all(axis=1), row.tolist()
         label = f"{depth:.3g} mm" + (f", {_degrees(phi)}" if several else "")
         if at.curve is not None:
-            label += f", {pressed_specimen(design.known.study, curve)}"
+            label += f", {pressed_specimen(design.known.study, int(curve))}"
+        if at.speed is not None:
+            label += f", {speed:.3g} mm/s, {hold:.3g} s"
         right.plot(at.s[own], choice.score[0, own], lw=1, label=label)
     for k in np.unique(choice.chosen):
         order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
         right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
-    right.legend(title="depth", fontsize="x-small" if several or at.curve is not None else None)
+    long = several or at.curve is not None or at.speed is not None
+    right.legend(title="depth", fontsize="x-small" if long else None)
     right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
     return figure
 

@@ -15,11 +15,10 @@ from jaxtrachea.inference.relaxation_curves import (
     Loop,
     Rate,
     Whose,
+    curves,
     loops,
-    moduli,
     parts_of,
     rates,
-    relaxation,
     specimens,
     times,
 )
@@ -67,15 +66,13 @@ def _compute(request: Request, findings: AnalysisResults, progress: Progress) ->
 
 def _of(result: FitResult, of: Whose) -> Curves:
     at = times(of.span)
-    parts = parts_of(result)
-    frequency = 1 / (2 * np.pi * at)
-    both = {part: moduli(result, of, frequency, part) for part in parts}
+    found = {part: curves(result, of, at, part) for part in parts_of(result)}
     return Curves(
         whose=of,
         time=at,
-        relaxation={part: relaxation(result, of, at, part) for part in parts},
-        storage={part: v[0] for part, v in both.items()},
-        loss={part: v[1] for part, v in both.items()},
+        relaxation={part: v[0] for part, v in found.items()},
+        storage={part: v[1] for part, v in found.items()},
+        loss={part: v[2] for part, v in found.items()},
         rates=tuple(rates(result, of)),
         loops=tuple(loops(result, of)),
     )
@@ -136,6 +133,7 @@ def energy_rows(found: list[Curves]) -> Iterator[Cells]:
                 "specimen": loop.specimen, "trial": loop.trial,
                 "s [mm]": None if np.isnan(loop.s) else loop.s,
                 "measured [N mm]": loop.measured, "model [N mm]": loop.model,
+                "model_low95 [N mm]": loop.low, "model_high95 [N mm]": loop.high,
             }  # fmt: skip
 
 
@@ -161,11 +159,17 @@ def _section(found: list[Curves]) -> list[str]:
         "step of the samples or the longest record, and beyond the speeds of the records. The "
         f"work of a record is met within {100 * max(off, default=0.0):.2g} % (`energy.csv`).",
         "![relaxation](relaxation.png)",
+        "![energy](energy.png)",
     ]
 
 
 def _figures(found: list[Curves]):
-    return {"relaxation.png": partial(draw_relaxation, found)} if found else {}
+    if not found:
+        return {}
+    return {
+        "relaxation.png": partial(draw_relaxation, found),
+        "energy.png": partial(draw_energy, found),
+    }
 
 
 def draw_relaxation(found: list[Curves]):
@@ -192,6 +196,24 @@ def draw_relaxation(found: list[Curves]):
         for axis in (first, second, third):
             if axis.lines:
                 axis.legend()
+    return figure
+
+
+def draw_energy(found: list[Curves]):
+    """Of the first specimens: work of each record against the speed of its loading, by position."""
+    figure, axes = grid(min(len(found), DRAWN), 3.0)
+    for c, axis in zip(found[:DRAWN], axes, strict=False):
+        axis.set(title=plain(c.whose.specimen), xlabel="speed [mm/s]", ylabel="work [N mm]")
+        known = [loop for loop in c.loops if loop.speed > 0]
+        for s in dict.fromkeys(loop.s for loop in known if not np.isnan(loop.s)) or (np.nan,):
+            own = [loop for loop in known if loop.s == s or np.isnan(s)]
+            speed, measured, model, low, high = np.array([v[3:] for v in own]).reshape(-1, 5).T
+            error = np.where(np.isfinite(high - low), [model - low, high - model], np.nan)
+            label = "all records" if np.isnan(s) else f"s = {s:.4g} mm"
+            drawn = axis.errorbar(speed, model, yerr=error, fmt="_", ms=9, label=label)
+            axis.plot(speed, measured, "o", ms=4, mfc="none", color=drawn[0].get_color())
+        axis.set(xscale="log")
+        axis.legend(title="o measured, - model")
     return figure
 
 

@@ -9,11 +9,15 @@ from jaxtyping import Float, Int
 from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.refusals import depths, unvalidated
+from jaxtrachea.fitting.relaxing import span_of
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.measurements.whole_record import loading_speed, longest_hold
 
-#: Candidates where the user does not say: of a level that iterates, and of a formula, which costs
-#: next to nothing.
-_FEW, _MANY = 250, 10_000
+#: Candidates where the user does not say: of a level that iterates, of a force that relaxes, and of
+#: a formula, which costs next to nothing.
+_FEW, _IN_TIME, _MANY = 250, 1_000, 10_000
+#: Speed (mm/s) and hold (s) of a press; None: the force knows no time.
+_Pace = tuple[float, float] | None
 
 
 class Candidates(NamedTuple):
@@ -24,12 +28,16 @@ class Candidates(NamedTuple):
         depth: largest tool displacement from first touch, mm.
         phi: contact angle, rad; None: all on the midline.
         curve: a curve of the lane on whose specimen it is; None: the first.
+        speed: of the tool, mm/s; None: the force knows no time.
+        hold: how long the tool then stays, s, 0 or more; with `speed`.
     """
 
     s: Float[np.ndarray, " C"]
     depth: Float[np.ndarray, " C"]
     phi: Float[np.ndarray, " C"] | None = None
     curve: Int[np.ndarray, " C"] | None = None
+    speed: Float[np.ndarray, " C"] | None = None
+    hold: Float[np.ndarray, " C"] | None = None
 
 
 def grid(
@@ -38,6 +46,7 @@ def grid(
     count: int = 10_000,
     phi: Sequence[float] = (0.0,),
     curve: Sequence[int] = (0,),
+    pace: Sequence[_Pace] = (None,),
 ) -> Candidates:
     """About `count` candidates in a reachable region, five depths at even positions.
 
@@ -47,13 +56,19 @@ def grid(
         count: of all candidates.
         phi: angles, rad; each at every position and depth.
         curve: see `Candidates`; all of it on each of these.
+        pace: speed and hold, see `Candidates`; all of it with each of these.
     """
     depths = np.linspace(*depth, 5) if depth[1] > depth[0] else np.array([depth[0]])
-    positions = np.linspace(*s, max(count // (len(depths) * len(phi) * len(curve)), 1))
-    of, turned, at, down = np.meshgrid(curve, phi, positions, depths, indexing="ij")
-    angles = turned.ravel() if np.any(turned) else None
-    curves = of.ravel().astype(int) if np.any(of) else None
-    return Candidates(at.ravel(), down.ravel(), angles, curves)
+    kinds = len(depths) * len(phi) * len(curve) * len(pace)
+    positions = np.linspace(*s, max(count // kinds, 1))
+    axes = np.meshgrid(curve, range(len(pace)), phi, positions, depths, indexing="ij")
+    of, moved, turned, at, down = (v.ravel() for v in axes)
+    timed = np.array([p for p in pace if p is not None]).reshape(-1, 2)
+    speed, hold = timed[moved].T if len(timed) else (None, None)
+    return Candidates(
+        at, down, turned if np.any(turned) else None, of.astype(int) if np.any(of) else None,
+        speed, hold,
+    )  # fmt: skip
 
 
 def pressed_curves(study: Study) -> list[int]:
@@ -119,11 +134,6 @@ def check(study: Study) -> None:
         ValueError: naming the parameters; or a joint study.
     """
     study.refuse_joint("a design")
-    if study.model.relaxes:
-        raise ValueError(
-            f"a design has no speed and no hold, and the force of this model relaxes (relaxation = "
-            f"{study.model.options.relaxation!r}); choose places with relaxation = 'off'"
-        )
     own = [p.name for p in study.free if p.scope == "trial"]
     if len(own) == len(study.free):
         raise ValueError(
@@ -146,9 +156,9 @@ def candidates_of(
         reach: as in `extrapolation`.
 
     Raises:
-        SpecError: positions outside the tube or where the tool reaches beyond its ends, depths of
-            more than its radius, angles that the model does not have, or unknowns that a new curve
-            would not share.
+        SpecError: as `_paces`; positions outside the tube or where the tool reaches beyond its
+            ends, depths of more than its radius, angles that the model does not have, or unknowns
+            that a new curve would not share.
     """
     try:
         check(study)
@@ -175,10 +185,56 @@ def candidates_of(
             f"design.depth: {depth[1]:g} mm, a tube is pressed no deeper than its radius, expected "
             f"at most {radius:g} mm; give less (trachea.radius is that of the tube)"
         )
-    count = (
-        (_FEW if level.iterates else _MANY) if section.candidates is None else section.candidates
-    )
-    return grid(s, depth, count, _angles(section.phi, study), pressed_curves(study))
+    usual = _FEW if level.iterates else _IN_TIME if level.relaxes else _MANY
+    count = usual if section.candidates is None else section.candidates
+    pace = _paces(section.speed, section.hold, study)
+    return grid(s, depth, count, _angles(section.phi, study), pressed_curves(study), pace)
+
+
+def _paces(
+    speed: tuple[float, ...] | None, hold: tuple[float, ...] | None, study: Study
+) -> list[_Pace]:
+    """Every speed with every hold; left out: the slowest and the fastest, the longest measured.
+
+    Raises:
+        SpecError: of a model that knows no time; no speed where the records have none; a hold that
+            is negative.
+    """
+    if not study.model.relaxes:
+        for key, given in (("speed", speed), ("hold", hold)):
+            if given is not None:
+                raise SpecError(
+                    f"design.{key}: this model is elastic, its force knows no time; leave it out, "
+                    "or choose a relaxation"
+                )
+        return [None]
+    curves = [c for lane in study.curves for c in lane]
+    if speed is None:
+        known = [v for c in curves if (v := loading_speed(c)) > 0]
+        if not known:
+            raise SpecError("design.speed: no record tells its speed; give one, as in ['1 mm/s']")
+        speed = (min(known), max(known))
+    if hold is None:
+        known = [h.duration for c in curves if (h := longest_hold(c)) is not None]
+        hold = (max(known, default=0.0),)
+    if min(hold) < 0:
+        raise SpecError(f"design.hold: {min(hold):g} s; expected 0 s or more")
+    return [(v, t) for v in sorted(set(speed)) for t in sorted(set(hold))]
+
+
+def beyond_records(study: Study, speed: float, hold: float, depth: float) -> str:
+    """Whether a press of so long is longer than the records; "" if not.
+
+    Args:
+        study: the study.
+        speed: mm/s.
+        hold: s.
+        depth: mm from first touch.
+    """
+    longest = span_of([c for lane in study.curves for c in lane]).longest
+    if depth / speed + hold <= longest * (1 + 1e-9):
+        return ""
+    return f"extrapolated from records of at most {longest:.3g} s"
 
 
 def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:

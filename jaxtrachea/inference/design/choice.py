@@ -49,11 +49,14 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     its own is eliminated. A candidate without equilibrium at some sample tells nothing: zeros.
 
     Raises:
-        ValueError: angles for a skeleton that is pressed on the midline alone.
+        ValueError: angles for a skeleton that is pressed on the midline alone; a force that relaxes
+            without speeds and holds, or these without such a force.
     """
     study = known.study
     if candidates.phi is not None and not study.model.level.off_midline:
         raise ValueError("presses off the midline need the skeleton 'sections'; leave phi out")
+    if study.model.relaxes != (candidates.speed is not None and candidates.hold is not None):
+        raise ValueError("presses have a speed and a hold where the force relaxes, and only there")
     parts = []
     curve = np.zeros(len(candidates.s), int) if candidates.curve is None else candidates.curve
     for g, k in enumerate(known.lane):
@@ -61,7 +64,8 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
         theta, approach = jnp.asarray(known.theta[g]), jnp.asarray(known.approach[k])
         guess = Guess(theta, study.lanes.value[k, 0], blend, approach)
         index = index_of_presses(study, int(k), curve)
-        place = Place(candidates.s, candidates.depth, candidates.phi, index)
+        of = candidates
+        place = Place(of.s, of.depth, of.phi, index, of.speed, of.hold)
         matrix = press_informations(study, known.samples, guess, place)
         matrix = matrix * (known.weight[g] / known.sigma[g] ** 2)
         matrix = np.nan_to_num(matrix, posinf=0.0, neginf=0.0)

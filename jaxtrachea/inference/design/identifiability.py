@@ -32,16 +32,23 @@ class Map(NamedTuple):
 
 
 def identifiability(
-    known: Situation, s: Float[np.ndarray, " n"], depth: float, phi: float = 0.0, curve: int = 0
+    known: Situation,
+    s: Float[np.ndarray, " n"],
+    depth: float,
+    phi: float = 0.0,
+    curve: int = 0,
+    pace: tuple[float, float] | None = None,
 ) -> Map:
     """Condition and weakest direction of presses to `depth` (mm) at every position (mm).
 
-    At one angle (rad), on the specimen of a curve (see `Candidates`). Conditions are geometric
+    At one angle (rad), on the specimen of a curve, with one speed and hold where the force relaxes
+    (see `Candidates`). Conditions are geometric
     means over the guesses, directions those of the first guess.
     """
     angles = np.full(len(s), phi) if phi else None
     curves = np.full(len(s), curve) if curve else None
-    added = gains(known, Candidates(s, np.full(len(s), depth), angles, curves))
+    timed = () if pace is None else (np.full(len(s), v) for v in pace)
+    added = gains(known, Candidates(s, np.full(len(s), depth), angles, curves, *timed))
     values, vectors = np.linalg.eigh(known.base[:, None] + added)
     condition = np.exp(np.mean(0.5 * np.log(values[..., -1] / values[..., 0]), axis=0))
     weakest = vectors[0, :, :, 0]

@@ -10,6 +10,7 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.measurements.presses import HOLD_BEGINS
 from jaxtrachea.optimisation.batching import PATHS
 from jaxtrachea.optimisation.programs import program
 
@@ -119,12 +120,16 @@ class Place(NamedTuple):
         depth: largest tool displacement from first touch, mm.
         phi: contact angle, rad; None: on the midline.
         index: which unknown every parameter reads, see `Lane`; (J,).
+        speed: of the tool, mm/s; None: the force knows no time.
+        hold: how long it then stays, s; with `speed`.
     """
 
     s: Any
     depth: Any
     phi: Any
     index: Any
+    speed: Any = None
+    hold: Any = None
 
 
 def press_informations(
@@ -155,12 +160,32 @@ def _information(model: FitModel, samples: int, sides: bool, guess: Guess, place
     theta, value, blend, approach = guess
     index = place.index[jnp.array(model.free_columns)]
     free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
-    share = jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
+    share, still = jnp.arange(1, samples + 1, dtype=theta.dtype) / samples, None
+    if place.speed is not None:
+        share, still = _ramp_and_hold(samples, place.hold)
     touch = values_of(model, free, value)["onset"]
     displacement = touch + share * place.depth - (1 - share) * approach
-    J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi)
+    time = None if still is None else share * (place.depth + approach) / place.speed + still
+    J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi, time)
+    if time is not None:  # the first sample is that of rest
+        J = J.reshape(len(J), -1, samples + 1)[:, :, 1:].reshape(len(J), -1)
     J = J if sides else J[:, :samples]
     at = jnp.where(index >= 0, index, len(theta))
     zero = jnp.zeros((len(theta), len(theta)), theta.dtype)
     gram = jnp.einsum("im,jm->ij", J, J)
     return zero.at[at[:, None], at[None]].add(gram, mode="drop")
+
+
+def _ramp_and_hold(
+    samples: int, hold: Float[Array, ""]
+) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+    """Share of the way and time since its end, s, of rest and so many samples after it.
+
+    Half of them lie evenly on the ramp and half in the hold, there evenly in the logarithm of the
+    time, as records are averaged; without a hold all lie on the ramp.
+    """
+    k = jnp.arange(samples + 1, dtype=hold.dtype)
+    ramp = jnp.where(hold > 0, samples - samples // 2, samples)
+    later = (k - ramp) / jnp.maximum(samples - ramp, 1)
+    still = jnp.where(k > ramp, hold * HOLD_BEGINS ** (1 - later), 0)
+    return jnp.minimum(k / ramp, 1), still

@@ -139,7 +139,10 @@ def _approaches(result: FitResult) -> Float[np.ndarray, " lanes"]:
     """How long before first touch the records of each lane begin, median of its curves, mm."""
     rows = zip(result.first_touch, result.study.curves, strict=True)
     before = (
-        [max(at - c.displacement.min(), 0.0) for at, c in zip(row.tolist(), curves, strict=False)]
+        [
+            max(at - c.rising.displacement.min(), 0.0)
+            for at, c in zip(row.tolist(), curves, strict=False)
+        ]
         for row, curves in rows
     )
     return np.array([np.median(lane) for lane in before])
