@@ -76,7 +76,7 @@ def point_of(study, seed=3):
     return jnp.asarray(guess + 0.2 * np.random.default_rng(seed).normal(size=guess.size))
 
 
-@pytest.mark.parametrize("kind", [*list(KINDS)[:3], *late(*list(KINDS)[3:])])
+@pytest.mark.parametrize("kind", ["line", "softening", *late("markers", "bonded", "fung")])
 def test_residual_is_that_of_the_press_in_time(kind):
     """In closed form beside `press_in_time` in forward mode, through lift-off."""
     options, marked = KINDS[kind]
