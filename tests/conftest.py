@@ -100,7 +100,7 @@ def _forget_programs():
     """
     global _compiled
     yield
-    if _compiled > 800 or _mapped() > 30_000:
+    if _compiled > 400 or _mapped() > 30_000:
         jax.clear_caches()
         gc.collect()
         _compiled = 0

@@ -39,7 +39,7 @@ def noisy():
 
 
 @pytest.mark.compiling
-@pytest.mark.parametrize("draws", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("draws", [20, pytest.param(1000, marks=pytest.mark.slow)])
 def test_noise_free_data_give_back_the_parameters(draws):
     """Draws from two decades in each parameter, noise-free.
 

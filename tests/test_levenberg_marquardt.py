@@ -188,15 +188,16 @@ def test_a_secant_update_knows_the_step_just_taken(dtype):
     """Afterwards the rest times the step is what the residual's second derivatives make of it."""
     far = jnp.full(4, 100, dtype)
     valley = Valley(-far, far, jnp.ones(4, dtype), brown_dennis)
-    step = np.array([-0.1, 0.05, 0.02, -0.03], dtype)
+    step = jnp.array([-0.1, 0.05, 0.02, -0.03], dtype)
 
     @jax.jit
-    def updated(theta, step):
+    def both(theta):
         old, new = valley.evaluate(theta), valley.evaluate(theta + step)
-        before = Rest(jnp.eye(4, dtype=dtype), jnp.asarray(False))
-        rest = secant_update(before, old, new, valley.cross_gradient(old, new), step)
-        return rest.matrix, (new.jacobian - old.jacobian).T @ new.value
+        change = (new.jacobian - old.jacobian).T @ new.value
+        return old, new, valley.cross_gradient(old, new), change
 
-    matrix, change = map(np.asarray, updated(np.array([-11, 13, -0.4, 0.2], dtype), step))
+    *given, change = both(np.array([-11, 13, -0.4, 0.2], dtype))
+    before = Rest(jnp.eye(4, dtype=dtype), jnp.asarray(False))
+    matrix = np.asarray(secant_update(before, *given, step).matrix)
     np.testing.assert_allclose(matrix @ step, change, rtol=1e6 * np.finfo(dtype).eps)
     np.testing.assert_array_equal(matrix, matrix.T)

@@ -189,7 +189,9 @@ def test_many_lanes_are_each_as_if_alone(unilateral):
 
 @pytest.mark.parametrize("unilateral", [True, False])
 def test_derivatives_in_both_modes_are_those_of_differences(unilateral):
-    t, elastic = (v[1:] for v in journey(40))  # before the first sample there is a corner
+    t, elastic = (
+        jnp.asarray(v[1:]) for v in journey(40)
+    )  # before the first sample there is a corner
 
     @jax.jit
     def of(elastic, log_gamma, log_tau):
@@ -224,11 +226,12 @@ def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilater
         np.testing.assert_allclose(value[i], plain[i], rtol=0, atol=1e-13)
         rows = np.moveaxis(np.concatenate(expected[i], axis=-1), -1, 1)
         np.testing.assert_allclose(by[i], rows, rtol=0, atol=1e-11)
-    assert relax_with_derivatives(t[0], elastic[0], elastic[:1], two())[1].elastic is None
+    t, elastic = jnp.asarray(t[0]), jnp.asarray(elastic[:1])
+    assert relax_with_derivatives(t, elastic[0], elastic, two())[1].elastic is None
 
 
 def test_directions_chain_a_law_of_few_numbers_to_its_branches():
-    t, elastic = journey(60)
+    t, elastic = map(jnp.asarray, journey(60))
     span, given = Span(0.05, 10.0), jnp.asarray([0.7, 0.2])
 
     def of(given):

@@ -39,6 +39,15 @@ def points(s, phi, radius=12.0, dtype="float64"):
     return Mesh(vertices, jnp.asarray(np.zeros((0, 3), np.int32)), normals, s, phi, distance)
 
 
+def as_arrays(tree):
+    """NumPy arrays as those of JAX, which the types of records ask for."""
+    return jax.tree.map(jnp.asarray, tree)
+
+
+def make_keys(*rows):
+    return regions.Keys(*as_arrays(rows))
+
+
 def random_keys(seed=0, s_c=73.0, dtype="float64", size=1.0, rings=15):
     def draw(*shape, by=1.0):
         return np.asarray(
@@ -126,7 +135,7 @@ def test_linear_field_along_the_tube(method, s_c):
 
     nodes = np.asarray(BINDING.nodes)
     slopes = np.asarray(np.tile(slope[1:], (17, 1)))
-    keys = regions.Keys(np.asarray(s_c), field(s_c), *[field(nodes)] * 3, slopes, slopes[0])
+    keys = make_keys(np.asarray(s_c), field(s_c), *[field(nodes)] * 3, slopes, slopes[0])
     got = OF[method](BINDING, np.asarray(0.4), keys)
     np.testing.assert_allclose(got, field(TUBE.s), atol=1e-13)
 
@@ -136,7 +145,7 @@ def test_linear_in_the_angle():
     U, J, V = np.array([[1.0, 2, 3], [-1, 0, 5], [4, 4, -2]])
     rows = [np.asarray(np.tile(v, (17, 1))) for v in (J, U, V)]
     still = np.zeros((17, 2))
-    keys = regions.Keys(np.asarray(73.0), np.asarray(J), *rows, still, still[0])
+    keys = make_keys(np.asarray(73.0), np.asarray(J), *rows, still, still[0])
     phi = np.linspace(-math.pi, math.pi, 61)
     back = 2 * math.pi - ALPHA
     wanted = np.stack(
@@ -155,7 +164,7 @@ def test_linear_in_the_angle():
 def test_key_points_are_met(method, phi_c, s_c):
     keys = random_keys(s_c=s_c)
     if s_c == 70.0:  # C on ring 7: one displacement, one place
-        keys = regions.Keys(
+        keys = make_keys(
             keys.s_c, keys.joints[7], keys.joints, keys.U, keys.V, keys.slopes, keys.slopes[7]
         )
     nodes = np.asarray(BINDING.nodes)
@@ -229,7 +238,7 @@ def test_axial_motion_is_linear_from_C_to_the_ends():
     rows = np.zeros((17, 3))
     rows[:, 0] = np.interp(nodes, [0, 73, 160], [0, 1, 0])
     still = np.zeros((17, 2))
-    keys = regions.Keys(
+    keys = make_keys(
         np.asarray(73.0), np.asarray([1.0, 0, 0]), *[np.asarray(rows)] * 3, still, still[0]
     )
     s = np.linspace(0, 160, 97)
@@ -255,7 +264,7 @@ def test_phong_interpolates_magnitude_and_angle(sign, at_C):
 
     contact, end = keyed(2.0, at_C, 0.0), keyed(1.0, 0.7, ALPHA)
     rows = [np.asarray(np.tile(v, (17, 1))) for v in (contact, 0 * end, end)]
-    keys = regions.Keys(np.asarray(73.0), np.asarray(contact), *rows)
+    keys = make_keys(np.asarray(73.0), np.asarray(contact), *rows)
     got = motion("phong", 42.0, ALPHA / 2, 0.0, keys)[0]
     np.testing.assert_allclose(got, keyed(1.5, (at_C + 0.7) / 2, ALPHA / 2), atol=1e-5)
 
@@ -267,7 +276,7 @@ def test_phong_moves_the_back_of_a_moving_tube_with_it(phi_c, tilt):
     turn = phi_c + tilt
     shift = -np.array([0.3 * tilt, math.cos(turn), math.sin(turn)])
     rows = [np.tile(shift, (17, 1))] * 3
-    keys = regions.Keys(np.asarray(73.0), shift, *rows)
+    keys = make_keys(np.asarray(73.0), shift, *rows)
     got = motion("phong", 42.0, np.linspace(-math.pi, math.pi, 61), phi_c, keys)
     np.testing.assert_allclose(got, np.broadcast_to(shift, got.shape), atol=2e-6)  # fade 1 um
 
@@ -285,7 +294,7 @@ def test_phong_on_the_back_of_a_flattened_tube():
 
     U, V = size * outward(-ALPHA - b), size * outward(ALPHA + b)
     rows = [np.tile(np.asarray(v), (17, 1)) for v in ([0.0, -2.0, 0.0], U, V)]
-    keys = regions.Keys(np.asarray(73.0), np.array([0.0, -2.0, 0.0]), *rows)
+    keys = make_keys(np.asarray(73.0), np.array([0.0, -2.0, 0.0]), *rows)
     share = np.linspace(0, 1, 21)
     phi = ALPHA + share * 2 * (math.pi - ALPHA)
     angle = phi + b * (1 - 2 * share)
@@ -309,7 +318,7 @@ def test_phong_at_rest_in_float32():
     of = jax.jit(jax.jacrev(surface_of("phong"), (1, 2)), compiler_options=QUICK)
     keys = random_keys(dtype="float32")
     small = keys.joints * np.where(np.arange(17) == 7, 1e-9, 1).astype("float32")[:, None]
-    moving = regions.Keys(keys.s_c, keys.contact, small, keys.U, keys.V)
+    moving = make_keys(keys.s_c, keys.contact, small, keys.U, keys.V)
     for keys in (jax.tree.map(np.zeros_like, moving), moving):
         for slope in jax.tree.leaves(of(AT32, np.asarray(0.4, "float32"), keys)):
             assert np.max(np.abs(slope)) < 10 / (160 * phong.FADE)
@@ -394,11 +403,11 @@ def test_float32_and_lanes(method):
 
 
 def test_misuse_is_told():
-    weights, keys = weigh(BINDING, np.asarray(0.4)), random_keys(rings=3)
+    weights, keys = as_arrays((weigh(BINDING, np.asarray(0.4)), random_keys(rings=3)))
     with pytest.raises(ValueError, match=r"keys have 5 rows; expected 17"):
         regions.interpolate(BINDING, weights, keys)
-    k = random_keys()
-    bare = regions.Keys(k.s_c, k.contact, k.joints, k.U, k.V)
+    k = as_arrays(random_keys())
+    bare = make_keys(k.s_c, k.contact, k.joints, k.U, k.V)
     with pytest.raises(ValueError, match=r"needs slopes and contact_slope"):
         regions.interpolate(BINDING, weights, bare)
     with pytest.raises(ValueError, match=r"count is 5; expected one of 1, 8, 16, 32"):
@@ -420,9 +429,7 @@ kernel = jitted(local._kernel, compiler_options=QUICK)
 
 
 def dent(count, spacing=1.5, reach=5.0, depth=(0.2, -1.0, 0.3), sag=0.0, dtype="float64"):
-    s, phi, radius, spacing, reach = (
-        np.asarray(v, dtype) for v in (73, 0.4, 12.0, spacing, reach)
-    )
+    s, phi, radius, spacing, reach = (np.asarray(v, dtype) for v in (73, 0.4, 12.0, spacing, reach))
     at = centres(s, phi, radius, spacing, count)
     wanted = targets(np.asarray(depth, dtype), np.full(count, sag, dtype))
     return at, wanted, fit(at, wanted, reach)
@@ -541,7 +548,7 @@ def test_shares_of_a_way_are_its_targets(dtype):
 
 def test_vertices_of_a_dent_wider_than_prepared_are_nan():
     chosen = local.runs(TUBE.s, jnp.asarray(1.0))
-    at, wanted, found = dent(8, spacing=2.0, reach=6.0)
+    at, wanted, found = as_arrays(dent(8, spacing=2.0, reach=6.0))
 
     def corrected(chosen):
         none = jnp.zeros_like(TUBE.straight)

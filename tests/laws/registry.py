@@ -201,6 +201,5 @@ ROWS = {
     ),
 }  # fmt: skip
 #: Long to compile, of a kind that another row is of too.
-SLOW = ("press_path", "press_oblique", "skeleton_response", "press, softening",
-        "press, two materials")  # fmt: skip
+SLOW = ("press_path", "skeleton_response", "press, softening", "press, two materials")
 EACH = [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in ROWS]

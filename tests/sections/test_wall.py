@@ -167,10 +167,11 @@ def test_rigid_motions():
 
 def test_many_sections_at_once():
     """`vmap` over the modes gives each as alone; a point knows its place."""
-    q, phi_c = np.random.default_rng(4).normal(size=(2, 3, 4)), np.asarray(0.0)
+    q, phi_c = jnp.asarray(np.random.default_rng(4).normal(size=(2, 3, 4))), jnp.asarray(0.0)
     s, same = np.array([0.0, 5.0, 9.0, 5.0]), np.full(4, 0.4)
     gathered = jitted(lambda *place: around(gather_points(*place), *SHAPE))
-    points, modes = gathered(s, same, same + 11), WallModes(q, 0.1 * q)
+    points = jax.tree.map(jnp.asarray, gathered(s, same, same + 11))
+    modes = WallModes(q, 0.1 * q)
     run = jitted(jax.vmap(lambda m: wall_motion(m, points, phi_c, *SHAPE)))
     both = run(modes)
     for i in range(2):
