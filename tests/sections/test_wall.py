@@ -126,15 +126,15 @@ move = jitted(wall_motion)
 
 
 @jitted
-def _carried(q, phi, distance, *shape):
-    points = around(gather_points(jnp.zeros_like(phi), phi, distance), *shape)
+def _carried(q, points, *shape):
     modes = WallModes(q[None], jnp.zeros_like(q)[None])
-    return wall_motion(modes, points, jnp.zeros((), q.dtype), *shape)
+    return wall_motion(modes, around(points, *shape), jnp.zeros((), q.dtype), *shape)
 
 
 def carried(q, phi=PHI, distance=DISTANCE, dtype="float64"):
     """Points of one section that no contact presses."""
-    return _carried(*(np.asarray(v, dtype) for v in (q, phi, distance, *SHAPE)))
+    points = gather_points(*(jnp.asarray(v, dtype) for v in (0 * phi, phi, distance)))
+    return _carried(np.asarray(q, dtype), points, *(np.asarray(v, dtype) for v in SHAPE))
 
 
 @pytest.mark.slow
@@ -168,10 +168,8 @@ def test_rigid_motions():
 def test_many_sections_at_once():
     """`vmap` over the modes gives each as alone; a point knows its place."""
     q, phi_c = jnp.asarray(np.random.default_rng(4).normal(size=(2, 3, 4))), jnp.asarray(0.0)
-    s, same = np.array([0.0, 5.0, 9.0, 5.0]), np.full(4, 0.4)
-    gathered = jitted(lambda *place: around(gather_points(*place), *SHAPE))
-    points = jax.tree.map(jnp.asarray, gathered(s, same, same + 11))
-    modes = WallModes(q, 0.1 * q)
+    s, same = jnp.asarray([0.0, 5.0, 9.0, 5.0]), jnp.full(4, 0.4)
+    points, modes = around(gather_points(s, same, same + 11), *SHAPE), WallModes(q, 0.1 * q)
     run = jitted(jax.vmap(lambda m: wall_motion(m, points, phi_c, *SHAPE)))
     both = run(modes)
     for i in range(2):
