@@ -217,8 +217,15 @@ def test_reactions_same_answer(split, shear):
             np.testing.assert_allclose(p, q, atol=2e-9 * float(peak), rtol=0, err_msg=name)
 
 
-@pytest.mark.parametrize("split", ["continuous", "independent"])
-@pytest.mark.parametrize("shear", [False, True])
+@pytest.mark.parametrize(
+    ("split", "shear"),
+    [
+        ("continuous", True),
+        ("independent", False),
+        pytest.param("continuous", False, marks=pytest.mark.slow),
+        pytest.param("independent", True, marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_of_both_forms(split, shear):
     """Between rings, on a ring (from the right, where they jump), and where a ring gives way."""
     b = table_1()
