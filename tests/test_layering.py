@@ -1,6 +1,7 @@
 """Data goes one way: a module imports only from rooms above it, and importing costs nothing."""
 
 import ast
+import functools
 import pathlib
 import subprocess
 import sys
@@ -152,17 +153,22 @@ def level(room, order):
     return found[0]
 
 
+@functools.cache
+def import_statements(source):
+    """Wherever they stand."""
+    statements = (ast.Import, ast.ImportFrom)
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, statements)]
+
+
 def imported(source, package):
-    """Dotted names of everything that `source` imports, wherever it stands."""
-    for node in ast.walk(ast.parse(source)):
+    """Dotted names of everything that `source` imports."""
+    for node in import_statements(source):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             base = package[: len(package) - node.level + 1] if node.level else []
             stem = [*base, *(node.module.split(".") if node.module else [])]
             names = [".".join([*stem, alias.name]) for alias in node.names]
-        else:
-            continue
         yield from names
 
 
