@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxtrachea.measurements import together
+from jaxtrachea.measurements import batch_checks
 from jaxtrachea.measurements.batch_checks import finish_all
 from jaxtrachea.measurements.checks import bad, finish
 from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
@@ -152,9 +152,9 @@ def same(a, b):
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-@pytest.mark.parametrize("block", [1, 100, together.BLOCK])
+@pytest.mark.parametrize("block", [1, 100, batch_checks.BLOCK])
 def test_same_as_one_by_one(name, block, monkeypatch):
-    monkeypatch.setattr(together, "BLOCK", block)
+    monkeypatch.setattr(batch_checks, "BLOCK", block)
     options = ReadOptions(**OPTIONS[name])
     records = [*PLAIN.values(), *ODD.values(), *PLAIN.values()]
     found = finish_all(records, options)
@@ -194,7 +194,7 @@ def test_plain_curves_are_not_looked_at_one_by_one(monkeypatch):
     def refuse(record, options):
         raise AssertionError(record)
 
-    monkeypatch.setattr(together, "finish", refuse)
+    monkeypatch.setattr(batch_checks, "finish", refuse)
     found = finish_all(list(PLAIN.values()), ReadOptions())
     assert all(isinstance(curve, Curve) for curve in found)
 

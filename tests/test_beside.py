@@ -4,7 +4,8 @@ import sys
 import threading
 
 import pytest
-from jaxtrachea.cli.requires import load_beside, requires
+
+from jaxtrachea.cli.beside import beside, load_beside
 
 
 def test_both_are_at_work_at_once_and_have_ended_after_the_block():
@@ -16,7 +17,7 @@ def test_both_are_at_work_at_once_and_have_ended_after_the_block():
         ended.append(name)
         return name
 
-    with requires(draw, "picture") as drawing:
+    with beside(draw, "picture") as drawing:
         meet.wait()
     assert ended == ["picture"]
     assert drawing.result() == "picture"
@@ -26,7 +27,7 @@ def test_an_error_is_raised_where_it_is_asked_for():
     def fail():
         raise OSError(28, "no space left")
 
-    with requires(fail) as drawing:
+    with beside(fail) as drawing:
         pass
     with pytest.raises(OSError, match="no space"):
         drawing.result()

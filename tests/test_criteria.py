@@ -340,7 +340,7 @@ def test_why_nothing_was_left_out():
     """A stiffness of single curves; an onset of single curves is no reason."""
     for names, says in ((("k_1", "onset"), "A: k_1 belongs to"), (("onset",), "no specimen has")):
         free = [dataclasses.replace(DEFAULTS[n], fixed=False, scope="trial") for n in names]
-        result = SimpleNamespace(study=SimpleNamespace(free=free, together=()))
+        result = SimpleNamespace(study=SimpleNamespace(free=free, holdout_groups=()))
         none = Missed(np.full(1, np.nan), *np.zeros((3, 1), int))
         (note,) = _left_out_notes([SimpleNamespace(name="A", result=result, left_out=none)])
         assert says in note

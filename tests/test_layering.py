@@ -47,7 +47,7 @@ WITHIN = {
         {"depth", "width"},
         {"wall", "effects"},
         {"plan", "spec"},
-        {"rules", "stage"},
+        {"rules", "stage", "tool_file"},
         {"landing", "lumen", "ranges", "trail", "paths"},
         {"approach"},
         {"facts", "refusals", "deform", "programs"},

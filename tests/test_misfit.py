@@ -108,4 +108,4 @@ def test_estimated_noise_is_not_compared():
     found = result.misfit
     assert np.isnan(found.ratio).all()
     assert MISFIT.section(result) == []
-    assert list(MISFIT.shown(result)) == []
+    assert list(MISFIT.sentences(result)) == []

@@ -89,9 +89,9 @@ def test_solve_spd(n, dtype):
 def test_cosine_and_sine(dtype, reach):
     """Against 40 digits, at random, small and huge angles and beside multiples of pi / 4."""
     rng = np.random.default_rng(0)
-    requires = np.arange(-40, 41) * np.pi / 4
+    beside = np.arange(-40, 41) * np.pi / 4
     small = 10.0 ** -np.arange(1, 20)
-    x = np.concatenate([rng.uniform(-reach, reach, 300), rng.normal(size=300), requires, small])
+    x = np.concatenate([rng.uniform(-reach, reach, 300), rng.normal(size=300), beside, small])
     x = np.append(x, [0.0, reach, -reach]).astype(dtype)
     both = jax.jit(cos_sin)
     got = np.asarray(both(jnp.asarray(x)))

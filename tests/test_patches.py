@@ -329,7 +329,7 @@ def distance_to(surface: trimesh.Trimesh, points):
     return np.array(found)
 
 
-def requires(surface: trimesh.Trimesh, count, radius, low, high, seed=0):
+def beside(surface: trimesh.Trimesh, count, radius, low, high, seed=0):
     """Centres of balls that hold a distance (or are pressed in) from random points of a surface."""
     points, face = trimesh.sample.sample_surface(surface, count, seed=seed)
     height = np.random.default_rng(seed).uniform(low, high, count)
@@ -341,7 +341,7 @@ def requires(surface: trimesh.Trimesh, count, radius, low, high, seed=0):
 def test_sphere_against_a_bent_and_flattened_surface():
     """Closest points on triangles, with rings, a flat back and a bend."""
     surface, p = bent(0.6, 0.15)
-    at = requires(surface, LANES, 2.0, -1.5, 4.0)
+    at = beside(surface, LANES, 2.0, -1.5, 4.0)
     c = solve(sphere(2.0), p, 0 * at, at, 3)
     error = c.gap - (distance_to(surface, at) - 2)
     # Recorded: -0.74 to 0.33 mm; lost 0.37 (crests of rings), filled 0.73 (hollows), bound 0.09.
@@ -439,7 +439,7 @@ def test_real_trachea():
     surface, outer, wall = outer_wall(m.mesh)
     borders = np.r_[0, m.geometry.ring_positions, m.geometry.length]
     p = patches_of(wall, borders, most=48)
-    at = requires(outer, LANES * 2, 2.0, -1.0, 3.0)
+    at = beside(outer, LANES * 2, 2.0, -1.0, 3.0)
     c = solve(sphere(2.0), p, 0 * at, at, 3)
     error = c.gap - (distance_to(surface, at) - 2)
     assert c.complete.all()

@@ -211,7 +211,7 @@ def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilater
         moved = scale[0] * e + scale[1] * e * e * e
         return tuple(relax(t, moved, Branches(jnp.exp(log_gamma), jnp.exp(log_tau)), unilateral))
 
-    def requires(t, e, scale, log_gamma, log_tau):
+    def beside(t, e, scale, log_gamma, log_tau):
         moved = scale[0] * e + scale[1] * e * e * e
         given = Branches(jnp.exp(log_gamma), jnp.exp(log_tau))
         columns = jnp.stack([e, e * e * e])
@@ -219,7 +219,7 @@ def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilater
 
     given = jnp.asarray([1.0, 0.05]), *map(jnp.log, two())
     axes = (0, 0, None, None, None)
-    value, by = jax.jit(jax.vmap(requires, axes))(t, elastic, *given)
+    value, by = jax.jit(jax.vmap(beside, axes))(t, elastic, *given)
     expected = jax.jit(jax.vmap(jax.jacfwd(of, argnums=(2, 3, 4)), axes))(t, elastic, *given)
     plain = jax.jit(jax.vmap(of, axes))(t, elastic, *given)
     for i in (0, 1):

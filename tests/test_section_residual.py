@@ -325,8 +325,8 @@ def test_lanes():
         seen = study_of([under], tool_radius=1.0, weighting=Weighting(pressed_ends=given))
         assert np.sum(seen.lanes.end_precision > 0) == count
     without = Weighting(pressed_ends=False)
-    requires = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0, weighting=without)
-    assert np.sum(requires.lanes.end_precision > 0) == 3 * 4
+    beside = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0, weighting=without)
+    assert np.sum(beside.lanes.end_precision > 0) == 3 * 4
     with pytest.raises(ValueError, match="pressed_ends=False needs tool_radius"):
         study_of([under], weighting=without)
     at_end = curve((20.0, np.pi / 2, (1.0, 0.0)))  # 30 degrees from it, 5.9 mm

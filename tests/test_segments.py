@@ -66,7 +66,7 @@ def zero_of(name):
     return -30.0 if name == "not zeroed" else 0.0
 
 
-def requires(found, first, stop, hole):
+def beside(found, first, stop, hole):
     """How many samples the choice differs by from the truth."""
     outside = int(found.keep[:first].sum() + found.keep[stop:].sum())
     return outside + abs(int((~found.keep[first:stop]).sum()) - hole)
@@ -78,7 +78,7 @@ def test_known_records(name, clock):
     displacement, first, stop, hole = KNOWN[name]
     times = None if clock is None else clock * np.arange(displacement.size)
     found = segment(displacement, force_of(displacement, zero_of(name)), times)
-    assert requires(found, first, stop, hole) <= 2
+    assert beside(found, first, stop, hole) <= 2
     ends = [0, *(part.stop for part in found.parts)]
     assert [part.start for part in found.parts] == ends[:-1]
     assert ends[-1] == displacement.size
@@ -93,7 +93,7 @@ def test_known_records_with_noise(name):
     noisy = displacement + 0.02 * rng.standard_normal(displacement.size)
     force = force_of(displacement, zero_of(name))
     force = force + 0.005 * np.ptp(force) * rng.standard_normal(force.size)
-    assert requires(segment(noisy, force), first, stop, hole) <= 12
+    assert beside(segment(noisy, force), first, stop, hole) <= 12
 
 
 def test_what_is_held():

@@ -237,7 +237,7 @@ def test_shipped_twins_are_mirror_images(name):
         for a in curves.values() for b in curves.values()
         if a is not b and abs(a.s_c + b.s_c - 160) < 1e-9
     }  # fmt: skip
-    assert pairs == {tuple(group) for group in spec.data.holdout_groups or ()}
+    assert pairs == {tuple(group) for group in spec.data.together or ()}
     for a, b in pairs:
         scale = np.max(np.abs(curves[a].force))
         np.testing.assert_allclose(curves[a].force, curves[b].force, atol=1e-9 * scale)

@@ -29,6 +29,7 @@ from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.spec import NEEDED, SceneSpec, SceneTracheaSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
+from jaxtrachea.scene.tool_file import read_tool
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import Landmarks, read_mesh
 from jaxtrachea.trachea.material import Material
@@ -84,7 +85,8 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         mesh = _tube(spec.trachea, geometry, material)
     tool = None
     if spec.tool is not None:
-        tool = Tool(_shape(spec.tool, folder, files), spec.tool.friction)
+        shape, seen = _shape(spec.tool, folder, files)
+        tool, notes = Tool(shape, spec.tool.friction), notes + seen
     path = path_of(spec, folder, files, geometry)
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
@@ -265,18 +267,26 @@ def _of_file(error: InputError) -> SpecError:
     return SpecError.like(named, place="", key=key, joint=named.joint if named.key else ": ")
 
 
-def _shape(section: ToolSection, folder: Path, files: list[Path]) -> shapes.Shape:
-    rounding = section.rounding or 0.0
+def _shape(
+    section: ToolSection, folder: Path, files: list[Path]
+) -> tuple[shapes.Shape, tuple[str, ...]]:
+    """The tool, and notes on its file."""
+    rounding, radius = section.rounding or 0.0, section.radius or 0.0
+    half = (section.length or 0.0) / 2
     if section.shape == "sphere":
-        return shapes.sphere(section.radius or 0.0)
+        return shapes.sphere(radius), ()
     if section.shape == "capsule":
-        return shapes.capsule((section.length or 0.0) / 2, section.radius or 0.0)
+        return shapes.capsule(half, radius), ()
     if section.shape == "cylinder":
-        return shapes.cylinder(
-            (section.length or 0.0) / 2, section.radius or 0.0, rounding, dtype=float
-        )
+        return shapes.cylinder(half, radius, rounding, dtype=float), ()
     if section.shape == "box":
-        return shapes.box(np.asarray(section.size) / 2, rounding)
+        return shapes.box(np.asarray(section.size) / 2, rounding), ()
     path = named_file(folder, section.file or "", "tool.file", files)
-    rows = read_table(path, "tool.file", ("x", "y", "z"), ())
-    return shapes.hull(rows, rounding)
+    if section.shape == "cloud":
+        return shapes.hull(read_table(path, "tool.file", ("x", "y", "z"), ()), rounding), ()
+    try:
+        shape, note = read_tool(path, section.unit, rounding)
+    except MeshError as error:
+        key = f"tool.{error.key}" if error.key else f"tool.file: {path.name}"
+        raise SpecError.like(error, place="", key=key) from None
+    return shape, (note,)

@@ -157,13 +157,14 @@ TOOLS = {
     "box": ({"size"}, {"rounding"}),
     "cylinder": ({"radius", "length"}, {"rounding"}),
     "cloud": ({"file"}, {"rounding"}),
+    "mesh": ({"file"}, {"unit", "rounding"}),
 }
 
 
 class ToolSection(Section):
     """[tool]: a convex shape about its own origin; capsule and cylinder along z."""
 
-    shape: Literal["sphere", "capsule", "box", "cylinder", "cloud"]
+    shape: Literal["sphere", "capsule", "box", "cylinder", "cloud", "mesh"]
     """which convex shape"""
     radius: PositiveLength | None = None
     """of sphere, capsule, cylinder"""
@@ -172,9 +173,11 @@ class ToolSection(Section):
     size: Sizes3 | None = None
     """edges of a box"""
     rounding: PositiveLength | None = None
-    """of box, cylinder and cloud; it comes on top of the size, on every side"""
+    """of box, cylinder, cloud and mesh; it comes on top of the size, on every side"""
     file: str | None = None
-    """of a cloud: CSV of x, y, z in mm"""
+    """of a cloud: CSV of x, y, z in mm; of a mesh: a convex surface, as STL, OBJ, PLY or GLB"""
+    unit: str | None = None
+    """of the file of a mesh: `mm` unless said"""
     friction: float | None = Field(None, ge=0, le=10)
     """coefficient of Coulomb friction"""
 

@@ -36,13 +36,13 @@ BESIDE = np.eye(5)
 @pytest.mark.parametrize("sizes", [8, *late(24)])
 @pytest.mark.parametrize("friction", [None, 0.5])
 @pytest.mark.parametrize("stretches", MATERIALS)
-@pytest.mark.parametrize("requires", [*BESIDE, np.ones(5)], ids=[*"spxyz", "all"])
-def test_presses_with_a_jitter(requires, stretches, friction, sizes):
+@pytest.mark.parametrize("beside", [*BESIDE, np.ones(5)], ids=[*"spxyz", "all"])
+def test_presses_with_a_jitter(beside, stretches, friction, sizes):
     """From 10 nm to 20 um, beside presses from a micrometre to 10 mm."""
     rng = np.random.default_rng(0)
     material = MATERIALS[stretches]
     for size in np.geomspace(1e-5, 0.02, sizes):
-        jitter = size * rng.choice([-1, 0, 0, 1], (4, 1)) * rng.uniform(0, 1, (4, 5)) * requires
+        jitter = size * rng.choice([-1, 0, 0, 1], (4, 1)) * rng.uniform(0, 1, (4, 5)) * beside
         depth = np.sort(10.0 ** rng.uniform(-3, 1, 4))
         D = jitter[:, 2:] - depth[:, None] * [0, 1, 0]
         path = Presses(75 + jitter[:, 0], jitter[:, 1], D)
@@ -56,8 +56,8 @@ def test_a_plan_counts_what_a_row_is_refused_for(where):
     phi, along = where
     for share, level in ((0.99 * PLANNED, False), (1.01 * PLANNED, True), (COVERED, True)):
         inward = np.array([0, -np.cos(phi), -np.sin(phi)])
-        requires = np.array([1, 0, 0] if along else [0, -np.sin(phi), np.cos(phi)])
-        D = [2 * inward + share * 3 * requires, 4 * inward]
+        beside = np.array([1, 0, 0] if along else [0, -np.sin(phi), np.cos(phi)])
+        D = [2 * inward + share * 3 * beside, 4 * inward]
         plan = make_scene(TUBE, SPRINGS, Presses([75.0] * 2, [phi] * 2, D), effects=ONE).plan
         assert plan.axial == (level and bool(along))
         assert plan.second_plane == (level or phi > 0)

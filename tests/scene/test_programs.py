@@ -26,7 +26,7 @@ from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond, unit_deflection
-from jaxtrachea.mechanics.press import touch as first_touch
+from jaxtrachea.mechanics.press import indentation as first_touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.lumen import in_lumen

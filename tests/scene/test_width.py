@@ -274,9 +274,9 @@ def test_paths_beside_a_path_lie_on_the_tube():
         scene = make_scene(TUBE, STIFF, path, effects=PUNCH)
         known = SceneFacts(spacing=10.0)
         full = Full(scene, STIFF, path, {}, known, PUNCH, PUNCH, None, np.array([s_c]))
-        requires = np.ravel(samples(full).s)
-        assert furthest(requires) == s_c
-        assert np.ptp(requires) == pytest.approx(2.5)
+        beside = np.ravel(samples(full).s)
+        assert furthest(beside) == s_c
+        assert np.ptp(beside) == pytest.approx(2.5)
 
 
 @pytest.mark.slow

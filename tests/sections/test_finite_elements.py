@@ -40,8 +40,8 @@ LIMITS = {
 
 def model(tube: Tube, place: str):
     """Geometry, stiffnesses and contact position."""
-    requires = (0 if place == "ring" else tube.pitch / 2) + tube.pitch * np.arange(tube.rings)
-    rings, middle = np.unique(np.concatenate([-requires, requires])), requires[-1] + tube.pitch
+    beside = (0 if place == "ring" else tube.pitch / 2) + tube.pitch * np.arange(tube.rings)
+    rings, middle = np.unique(np.concatenate([-beside, beside])), beside[-1] + tube.pitch
     wall = Wall(
         E_C=tube.E_C, E_L=tube.E_L, E_M=tube.E_M, nu=tube.nu, h=tube.h, h_C=tube.h * tube.share,
         h_M=tube.h_M, bed_n=tube.bed_n, bed_t=tube.bed_t,

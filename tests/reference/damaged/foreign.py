@@ -22,7 +22,7 @@ def alone(content, *says, spec=SPEC):
     return Case(("data.csv", *says), {"data.csv": content, "spec.toml": spec})
 
 
-def requires(content, *says):
+def beside(content, *says):
     """One of two files is foreign: the other stands."""
     files = {"data.csv": content, "good.csv": OTHER}
     files["spec.toml"] = '[data]\nfiles = ["data.csv", "good.csv"]\n'
@@ -70,10 +70,10 @@ KINDS = {
     "workbook with nothing in it": alone(zipped(xl__workbook_dot_xml=GOOD), "workbook"),
     "workbook cut off": alone(part(SHEET, "<x/>" * 99)[:150], "zip archive"),
     "old workbook": alone(b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(999), "xls", "password"),
-    "Word document": requires(zipped(word__document_dot_xml="x"), "zip archive"),
+    "Word document": beside(zipped(word__document_dot_xml="x"), "zip archive"),
     "zip of CSV": alone(zipped(a_dot_csv=GOOD), "zip archive", "unpack"),
     "zip of nothing": alone(zipped(), "zip archive"),
-    "bzip2": requires(bz2.compress(GOOD.encode()), "not text"),
+    "bzip2": beside(bz2.compress(GOOD.encode()), "not text"),
     "tar": alone(tar(), "not text"),
     "gzip cut off": alone(packed(GOOD.encode())[:-9], "gzip", "cut off"),
     "gzip with a wrong sum": alone(packed(GOOD.encode())[:-8] + bytes(8), "gzip", "damaged"),
@@ -82,7 +82,7 @@ KINDS = {
     "gzip of tar": alone(packed(tar()), "packed by gzip", "not text"),
     "gzip of 300 MB of blanks": alone(packed(b" " * 2**20) * 300, "unpacks to more than"),
     "gzip of a broken table": alone(packed(GOOD.replace("0.66", "x").encode()), "line 4", "'x'"),
-    "npy": requires(saved(np.save, NUMBERS), "npy", "savetxt"),
+    "npy": beside(saved(np.save, NUMBERS), "npy", "savetxt"),
     "npz": alone(saved(np.savez, a=NUMBERS), "zip archive"),
     "MATLAB 5": alone(b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(128) + PNG, "version 5"),
     "MATLAB 7.3": alone(
@@ -92,7 +92,7 @@ KINDS = {
     "Parquet": alone(b"PAR1\x15\x04" + PNG + b"PAR1", "Parquet", "to_csv"),
     "pickle": alone(pickle.dumps(NUMBERS), "not text", "CSV"),
     "PDF": alone(b"%PDF-1.7\n%\xe2\xe3\xcf\xd3\n" + PNG, "PDF"),
-    "PNG": requires(PNG, "not text", "numbers"),
+    "PNG": beside(PNG, "not text", "numbers"),
     "xz": alone(lzma.compress(GOOD.encode() * 9), "not text"),
     "SQLite": alone(b"SQLite format 3\0" + PNG, "not text"),
     "web page": alone("<!DOCTYPE html>\n<html>sign in</html>\n", "displacement"),

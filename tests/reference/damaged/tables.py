@@ -12,7 +12,7 @@ def alone(content, *says, spec=SPEC):
     return Case(("data.csv", *says), {"data.csv": content, "spec.toml": spec})
 
 
-def requires(content, *says, spec=""):
+def beside(content, *says, spec=""):
     """One of two files is spoilt: the other stands."""
     files = {"data.csv": content, "good.csv": OTHER}
     files["spec.toml"] = '[data]\nfiles = ["data.csv", "good.csv"]\n' + spec
@@ -21,7 +21,7 @@ def requires(content, *says, spec=""):
 
 def changed(old, new, *says):
     assert old in GOOD
-    return requires(GOOD.replace(old, new, 1), *says)
+    return beside(GOOD.replace(old, new, 1), *says)
 
 
 def with_column(name, *values):
@@ -33,7 +33,7 @@ def with_column(name, *values):
 CUT = {f"cut after {n} bytes": alone(LONG[:n]) for n in (0, 1, 9, 30, 48, 50, 51, 55, 60, 70)}
 FLIPPED = {
     f"bits flipped, seed {seed}": Case(
-        ("data.csv",), requires(flipped(GOOD.encode(), seed, 1 + seed % 4)).files,
+        ("data.csv",), beside(flipped(GOOD.encode(), seed, 1 + seed % 4)).files,
         command=("check", "spec.toml"), codes=(0, 1),
     )
     for seed in range(30)
@@ -45,13 +45,13 @@ DIALECT = {
     "text after a quote": changed("T01,1,35,1,", '"T01"x,1,35,1,', "line 4", "quote"),
     "decimal commas": changed("0.5,0.31", "0,5,0,31", "line 3", "decimal commas"),
     "header lost": alone(GOOD.removeprefix(HEAD), "displacement", "force"),
-    "header twice": requires(HEAD + GOOD, "line 2"),
+    "header twice": beside(HEAD + GOOD, "line 2"),
     "header in the middle": changed("T01,1,35,1,0.66\n", HEAD, "line 2", "line 5"),
     "header of numbers": alone("1,2,3\n4,5,6\n", "force"),
-    "two decimal signs": requires(
+    "two decimal signs": beside(
         GOOD.replace(",", ";").replace("0.5", "0,5"), "line 3", "decimal sign"
     ),
-    "thousands": requires(GOOD.replace(",", ";").replace("1.08", "1,234.5"), "line 5", "thousands"),
+    "thousands": beside(GOOD.replace(",", ";").replace("1.08", "1,234.5"), "line 5", "thousands"),
     "bars": alone(GOOD.replace(",", "|"), "displacement"),
     "mixed delimiters": changed("T01,1,35,1,", "T01;1;35;1;", "line 4 has 1 cells"),
     "one column": alone("force [N]\n1\n2\n3\n", "displacement"),
@@ -66,9 +66,9 @@ DIALECT = {
         "specimen,a" + " " * 10**6 + "b\n1,2\n", "displacement"
     ),
     "line of dashes": changed("T01,1,35,0,0\n", "-----\n", "line 2 has 1 cells"),
-    "total below": requires(GOOD + "Total,,,,2.05\n", "line 6"),
+    "total below": beside(GOOD + "Total,,,,2.05\n", "line 6"),
     "specimen lost": changed("T01,1,35,1,", ",1,35,1,", "line 4", "specimen"),
-    "curve in two blocks": requires(GOOD + "T09,1,35,0,0\nT01,1,35,2,3\n", "again in line 7"),
+    "curve in two blocks": beside(GOOD + "T09,1,35,0,0\nT01,1,35,2,3\n", "again in line 7"),
     "bell in a name": changed("T01,1,35,1,", "T\a1,1,35,1,", "line 4", "unprintable"),
     "JSON line broken": alone('{"s": "17 mm"\n' + GOOD, "line 1", "JSON"),
     "JSON line a list": alone('[1, 2]\n' + GOOD),
@@ -80,8 +80,8 @@ DIALECT = {
 }  # fmt: skip
 ENCODING = {
     "UTF-16 without mark": alone(GOOD.encode("utf-16-le"), "zero bytes"),
-    "UTF-16 cut in a character": requires(GOOD.encode("utf-16")[:-3], "line 5"),
-    "UTF-16 of odd bytes": requires(b"\xff\xfe" + GOOD.encode(), "data.csv"),
+    "UTF-16 cut in a character": beside(GOOD.encode("utf-16")[:-3], "line 5"),
+    "UTF-16 of odd bytes": beside(b"\xff\xfe" + GOOD.encode(), "data.csv"),
     "UTF-32": alone(GOOD.encode("utf-32-le"), "zero bytes"),
     "UTF-7": alone(GOOD.encode("utf-7").replace(b"[", b"+AFs-"), "displacement"),
     "EBCDIC": alone(GOOD.encode("cp500"), "displacement"),
@@ -103,39 +103,39 @@ VALUES = {
     "displacement nan": changed("1,0.66", "nan,0.66", "line 4", "displacement"),
     # Not refused: check says how much of the curve is used (tests/test_segments.py).
     "displacement falls": dataclasses.replace(changed("1,0.66", "0.2,0.66"), codes=(0,)),
-    "displacement must not fall": requires(
+    "displacement must not fall": beside(
         GOOD.replace("1,0.66", "0.2,0.66"), "line 4", spec='loading = "require-monotone"\n'
     ),
     "displacement in km": changed("1.5,1.08", "1.5e6,1.08", "line 5", "unit"),
-    "displacement tiny": requires(
+    "displacement tiny": beside(
         HEAD + "".join(f"T01,1,35,{i}e-9,{i}\n" for i in range(4)), "covers", "unit"
     ),
-    "displacement constant": requires(
+    "displacement constant": beside(
         HEAD + "".join(f"T01,1,35,1,{i}\n" for i in range(4)), "covers"
     ),
-    "force constant": requires(HEAD + "".join(f"T01,1,35,{i},2\n" for i in range(4)), "force is 2"),
-    "upside down": requires(HEAD + "".join(f"T01,1,35,{i},-{i}\n" for i in range(4)), "force_sign"),
-    "unloading": requires(HEAD + "".join(f"T01,1,35,{3 - i},{i}\n" for i in range(4))),
-    "one sample": requires(HEAD + f"T01,1,35,{ROWS[3]}\n", "samples"),
+    "force constant": beside(HEAD + "".join(f"T01,1,35,{i},2\n" for i in range(4)), "force is 2"),
+    "upside down": beside(HEAD + "".join(f"T01,1,35,{i},-{i}\n" for i in range(4)), "force_sign"),
+    "unloading": beside(HEAD + "".join(f"T01,1,35,{3 - i},{i}\n" for i in range(4))),
+    "one sample": beside(HEAD + f"T01,1,35,{ROWS[3]}\n", "samples"),
     "position changes": changed("T01,1,35,1,", "T01,1,36,1,", "s varies"),
     "position nan": changed("T01,1,35,1,", "T01,1,nan,1,", "line 4", "s is empty"),
-    "position infinite": requires(GOOD.replace(",35,", ",inf,"), "position"),
-    "position 1e9": requires(GOOD.replace(",35,", ",1e9,"), "position"),
-    "position beyond the tube": requires(GOOD.replace(",35,", ",161,"), "0 to 160 mm"),
-    "position before the tube": requires(GOOD.replace(",35,", ",-0.1,"), "0 to 160 mm"),
-    "angle 400 deg": requires(
+    "position infinite": beside(GOOD.replace(",35,", ",inf,"), "position"),
+    "position 1e9": beside(GOOD.replace(",35,", ",1e9,"), "position"),
+    "position beyond the tube": beside(GOOD.replace(",35,", ",161,"), "0 to 160 mm"),
+    "position before the tube": beside(GOOD.replace(",35,", ",-0.1,"), "0 to 160 mm"),
+    "angle 400 deg": beside(
         GOOD.replace("s [mm]", "s [mm],phi [deg]").replace(",35,", ",35,400,"), "turn"
     ),
-    "angle off the midline": requires(
+    "angle off the midline": beside(
         GOOD.replace("s [mm]", "s [mm],phi [deg]").replace(",35,", ",35,30,"), "midline"
     ),
-    "sigma zero": requires(with_column("sigma [N]", 0, 0, 0, 0), "sigma is not positive"),
-    "sigma negative": requires(with_column("sigma [N]", 1, -1, 1, 1), "sigma", "line 3"),
-    "sigma nan": requires(with_column("sigma [N]", 1, 1, "nan", 1), "sigma", "line 4"),
-    "marker infinite": requires(with_column("joint_3 [mm]", 1, 1, "inf", 1), "markers", "line 4"),
+    "sigma zero": beside(with_column("sigma [N]", 0, 0, 0, 0), "sigma is not positive"),
+    "sigma negative": beside(with_column("sigma [N]", 1, -1, 1, 1), "sigma", "line 3"),
+    "sigma nan": beside(with_column("sigma [N]", 1, 1, "nan", 1), "sigma", "line 4"),
+    "marker infinite": beside(with_column("joint_3 [mm]", 1, 1, "inf", 1), "markers", "line 4"),
     "marker on ring 0": alone(with_column("joint_0 [mm]", 1, 1, 1, 1), "joint_0", "from 1"),
-    "marker on ring 16": requires(with_column("joint_16 [mm]", 0, 1, 2, 3), "ring 16 of 15"),
-    "marker on ring 9999": requires(with_column("joint_9999 [mm]", 0, 1, 2, 3), "ring"),
+    "marker on ring 16": beside(with_column("joint_16 [mm]", 0, 1, 2, 3), "ring 16 of 15"),
+    "marker on ring 9999": beside(with_column("joint_9999 [mm]", 0, 1, 2, 3), "ring"),
 }  # fmt: skip
 UNITS = {
     "no unit of force": alone(GOOD.replace(" [N]", ""), "force", "units.force"),
