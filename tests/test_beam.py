@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jitted import jitted
 from late import late
 
 from jaxtrachea.mechanics import beam as room
@@ -39,12 +40,18 @@ def table_1(k=0.1, dtype="float64"):
 
 
 @functools.cache
-def jitted(split="continuous", form="recursion"):
-    return jax.jit(lambda b, s, f: deflect(b, s, f, split=split, form=form))
+def solver(split="continuous", form="recursion"):
+    return jitted(lambda b, s, f: deflect(b, s, f, split=split, form=form))
 
 
-many = jax.jit(jax.vmap(deflect, (None, 0, None)))
-compliances = jax.jit(contact_compliance, static_argnames="split")
+@functools.cache
+def many_of(form="recursion", split="continuous"):
+    one = functools.partial(deflect, form=form, split=split)
+    return jitted(jax.vmap(one, (None, 0, None)))
+
+
+many = many_of()
+compliances = jitted(contact_compliance, static_argnames="split")
 
 
 @functools.cache
@@ -123,7 +130,7 @@ def test_random_beams_against_fem(with_shear, with_load, dtype):
         exact = beam_fem.solve(x, length, EI, k, s, force, GA, load)
         beam = beam_of(x, length, EI, k, GA, dtype)
         args = beam, jnp.asarray(s, dtype), jnp.asarray(force, dtype)
-        got = deflect_loaded(*args, jnp.asarray(load, dtype)) if with_load else jitted()(*args)
+        got = deflect_loaded(*args, jnp.asarray(load, dtype)) if with_load else solver()(*args)
         errors = beam_accuracy.compare(got, exact)
         if with_load:
             differences = [errors.pop(q) for q in ("w", "theta", "theta_C")]
@@ -133,7 +140,7 @@ def test_random_beams_against_fem(with_shear, with_load, dtype):
             assert_exact(errors, (x, length, EI, k, GA), s, exact, dtype)
 
 
-deflect_loaded = jax.jit(lambda b, s, f, load: deflect(b, s, f, ring_load=load))
+deflect_loaded = jitted(lambda b, s, f, load: deflect(b, s, f, ring_load=load))
 
 
 @pytest.mark.parametrize("form", ["recursion", "reactions"])
@@ -142,7 +149,7 @@ def test_independent_against_fem(s, form):
     """Paper eq. 3: each cantilever alone under its share."""
     b = table_1()
     w_C, reactions = beam_fem.solve_independent(b.x, b.length, b.EI, b.k, s, 0.3)
-    got = jitted("independent", form)(b, jnp.asarray(s), jnp.asarray(0.3))
+    got = solver("independent", form)(b, jnp.asarray(s), jnp.asarray(0.3))
     tolerance = 1e-12 if form == "recursion" else 1e-9
     np.testing.assert_allclose(got.w_C, float(w_C), rtol=tolerance)
     expected = np.array(reactions, dtype=float)
@@ -164,11 +171,16 @@ def test_cantilever_reference():
     """
     k, bending = jnp.full(15, 0.1), jnp.full(16, 1.86)
     h = jnp.asarray([10.0] * 15 + [5.0])
-    side = room._Side(h, bending, None, k, None)
-    last, nodes, passed = room._sweep(side)
-    force, zero = jnp.asarray(0.1), jnp.zeros(())
-    _, _, R = room._back_substitute(side, nodes, passed, force, zero)
-    np.testing.assert_allclose(room._tip(side, last).g.a * force, CANTILEVER_TIP, rtol=5e-13)
+
+    @jax.jit
+    def solved(force):
+        side = room._Side(h, bending, None, k, None)
+        last, nodes, passed = room._sweep(side)
+        _, _, R = room._back_substitute(side, nodes, passed, force, jnp.zeros(()))
+        return room._tip(side, last).g.a * force, R
+
+    tip, R = solved(jnp.asarray(0.1))
+    np.testing.assert_allclose(tip, CANTILEVER_TIP, rtol=5e-13)
     np.testing.assert_allclose(R, CANTILEVER_R, rtol=6e-10)
 
 
@@ -198,29 +210,37 @@ def test_reactions_same_answer(split, shear):
         b = Beam(b.x, b.length, b.EI, b.k, jnp.full(16, 2.0))
     for s in (5.0, 60.0, 61.0, 155.0):
         args = b, jnp.asarray(s), jnp.asarray(-0.2)
-        one, two = jitted(split)(*args), jitted(split, "reactions")(*args)
+        one, two = solver(split)(*args), solver(split, "reactions")(*args)
         for name in one._fields:
             p, q = getattr(one, name), getattr(two, name)
-            peak = jnp.max(jnp.abs(two.theta if name == "theta_C" else q))
+            peak = np.max(np.abs(two.theta if name == "theta_C" else q))
             np.testing.assert_allclose(p, q, atol=2e-9 * float(peak), rtol=0, err_msg=name)
 
 
-@pytest.mark.parametrize("split", ["continuous", "independent"])
-@pytest.mark.parametrize("shear", [False, True])
+@pytest.mark.parametrize(
+    ("split", "shear"),
+    [
+        ("continuous", True),
+        ("independent", False),
+        pytest.param("continuous", False, marks=pytest.mark.slow),
+        pytest.param("independent", True, marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_of_both_forms(split, shear):
     """Between rings, on a ring (from the right, where they jump), and where a ring gives way."""
     b = table_1()
-    b = Beam(b.x, b.length, b.EI, b.k.at[4].set(0.0), jnp.full(16, 2.0) if shear else None)
+    k = np.where(np.arange(15) == 4, 0.0, b.k)
+    b = Beam(b.x, b.length, b.EI, k, np.full(16, 2.0) if shear else None)
 
     def moved(b, s, form):
         found = deflect(b, s, -0.2, split=split, form=form)
         return found.w_C + found.w[6] + 10 * found.theta[8]
 
-    derivatives = jax.jit(jax.grad(moved, argnums=(0, 1)), static_argnums=2)
+    derivatives = jitted(jax.grad(moved, argnums=(0, 1)), static_argnums=2)
     for s in (44.0, 50.0, 70.0):
         one, two = (jax.tree.leaves(derivatives(b, s, form)) for form in ("recursion", "reactions"))
         for p, q in zip(one, two, strict=True):
-            atol = 1e-12 + 1e-7 * float(jnp.max(jnp.abs(p)))
+            atol = 1e-12 + 1e-7 * float(np.max(np.abs(p)))
             np.testing.assert_allclose(q, p, atol=atol, rtol=0)
 
 
@@ -242,10 +262,10 @@ def test_off_the_beam_nothing_is_known(form):
     b, s = table_1(), np.array([-5.0, -1e-9, 0.0, 80.0, 160.0, 165.0, np.nan])
     lost = [True, True, False, False, False, True, True]
     if form == "recursion":
-        found = [contact_compliance(b, s), [contact_compliance(b, v) for v in s]]
+        found = [compliances(b, s), [compliances(b, v) for v in s]]
     else:
-        found = [jax.vmap(lambda v: deflect(b, v, 1.0, form=form).reaction[0])(s)]
-    found.append(jax.vmap(lambda v: deflect(b, v, 1.0, form=form).w_C)(s))
+        found = [many_of(form)(b, s, 1.0).reaction[:, 0]]
+    found.append(many_of(form)(b, s, 1.0).w_C)
     for values in found:
         assert np.isnan(values).tolist() == lost
 
@@ -279,7 +299,7 @@ def test_reactions_refuses_ring_load():
         deflect(b, jnp.asarray(5.0), jnp.asarray(1.0), form="reactions", ring_load=jnp.ones(15))
 
 
-slope = jax.jit(jax.vmap(jax.grad(contact_compliance, argnums=1), (None, 0)))
+slope = jitted(jax.vmap(jax.grad(contact_compliance, argnums=1), (None, 0)))
 
 
 @pytest.mark.parametrize("k", [1e-9, 1e-3, 0.1, 10.0, 1e6])
@@ -287,7 +307,7 @@ def test_compliance_is_smooth_across_rings(k):
     """C and dc/ds_c: left limit, value on the ring and right limit are one number."""
     b = table_1(k)
     step = 1e-7
-    x = b.x
+    x = np.asarray(b.x)
     c = [compliances(b, x + e) for e in (-step, 0.0, step)]
     dc = [slope(b, x + e) for e in (-step, 0.0, step)]
     scale = np.max(np.abs(slope(b, x + 2.0)))  # a rigid ring itself has c = 1/k, dc = 0
@@ -303,7 +323,7 @@ def test_compliance_is_smooth_across_rings(k):
 
 def test_independent_jumps_across_rings():
     b = table_1()
-    x = jnp.delete(b.x, 7)  # by symmetry there is no jump on the middle ring
+    x = np.delete(b.x, 7)  # by symmetry there is no jump on the middle ring
     left, right = (compliances(b, x + e, split="independent") for e in (-1e-7, 1e-7))
     assert np.min(np.abs(right / left - 1)) > 1e-3
 
@@ -313,10 +333,10 @@ def test_independent_jumps_across_rings():
 def test_compliance_of_many_points(split, dtype):
     """M positions in one call are the m single answers of `deflect`."""
     b = table_1(dtype=dtype)
-    s = jnp.asarray([0.5, 10.0, 77.3, 80.0, 159.0], dtype)
+    s = np.asarray([0.5, 10.0, 77.3, 80.0, 159.0], dtype)
     at_once = compliances(b, s, split=split)
     one = jnp.asarray(1.0, dtype)
-    alone = jnp.stack([jitted(split)(b, v, one).w_C for v in s])
+    alone = np.stack([solver(split)(b, v, one).w_C for v in s])
     np.testing.assert_allclose(at_once, alone, rtol=20 * np.finfo(dtype).eps)
     assert at_once.dtype == dtype
     assert compliances(b, s[2], split=split).shape == ()
@@ -347,12 +367,12 @@ def test_equilibrium_and_energy(exponents, s, force):
     x = jnp.asarray([11.0, 30.0, 47.0, 60.0, 82.0, 110.0])
     EI, k = 10.0 ** np.array(exponents[:7]), 0.1 * 10.0 ** np.array(exponents[7:])
     b = beam_of(x, 120.0, EI, k)
-    got = jitted()(b, jnp.asarray(s), jnp.asarray(force))
+    got = solver()(b, jnp.asarray(s), jnp.asarray(force))
     strain, clamps = _element_energy_and_shears(b, s, got)
     # 1e-7: the element forces are differences of nodal motions, magnified by (span / s)^3.
     closeness = 1e-7 * max(1.0, (1.0 / min(abs(s - v) + 1e-3 for v in x.tolist())))
-    np.testing.assert_allclose(jnp.sum(got.reaction) + clamps, force, rtol=closeness)
-    stored = strain + float(jnp.sum(got.reaction * got.w)) / 2
+    np.testing.assert_allclose(np.sum(got.reaction) + clamps, force, rtol=closeness)
+    stored = strain + float(np.sum(got.reaction * got.w)) / 2
     np.testing.assert_allclose(stored, force * float(got.w_C) / 2, rtol=closeness)
     np.testing.assert_array_equal(got.reaction, b.k * got.w)
     assert float(got.w_C) * force > 0
@@ -363,7 +383,7 @@ def test_signs(k):
     """The ring under the load pushes back; the moment at C keeps both beams together."""
     b = table_1(k)
     got = many(b, b.x, jnp.asarray(1.0))
-    under = jnp.diagonal(got.reaction)
+    under = np.diagonal(got.reaction)
     assert np.all(under > 0)
     # No ring takes more than the load, except that rings can hold each other down.
     assert np.all(under <= 1 + 1e-6)
@@ -376,8 +396,8 @@ def test_reciprocity(k):
     """Maxwell-Betti: w_i of a load at ring j is w_j of the same load at ring i."""
     b = table_1(k)
     w = many(b, b.x, jnp.asarray(1.0)).w
-    np.testing.assert_allclose(w, w.T, atol=1e-12 * float(jnp.max(w)))
-    np.testing.assert_allclose(jnp.diagonal(w), compliances(b, b.x), rtol=1e-11)
+    np.testing.assert_allclose(w, w.T, atol=1e-12 * float(np.max(w)))
+    np.testing.assert_allclose(np.diagonal(w), compliances(b, b.x), rtol=1e-11)
 
 
 def test_mirror():
@@ -393,26 +413,26 @@ def test_mirror():
     for name, sign in (("w", 1), ("theta", -1), ("reaction", 1)):
         p, q = getattr(one, name), sign * getattr(two, name)[::-1]
         # (length - x) is rounded to float32 here, hence not closer.
-        np.testing.assert_allclose(p, q, atol=3e-5 * float(jnp.max(jnp.abs(p))), err_msg=name)
+        np.testing.assert_allclose(p, q, atol=3e-5 * float(np.max(np.abs(p))), err_msg=name)
     np.testing.assert_allclose(one.force_A + two.force_A, 1.0, rtol=1e-4)
 
 
 @pytest.mark.parametrize("split", ["continuous", "independent"])
 def test_linear_in_force(split):
     b, s = table_1(), jnp.asarray(63.0)
-    one, two = (jitted(split)(b, s, jnp.asarray(f)) for f in (1.0, -3.5))
+    one, two = (solver(split)(b, s, jnp.asarray(f)) for f in (1.0, -3.5))
     for p, q in zip(one, two, strict=True):
         np.testing.assert_allclose(-3.5 * p, q, rtol=1e-13)
-    zero = jitted(split)(b, s, jnp.asarray(0.0))
+    zero = solver(split)(b, s, jnp.asarray(0.0))
     assert all(np.all(np.asarray(v) == 0) for v in zero)
 
 
 def test_ring_load_is_a_force_at_a_ring():
     """A load on ring 6 alone is a contact force at x_6 (but for who is called the ring's load)."""
     b = table_1()
-    load = jnp.zeros(15).at[5].set(0.3)
+    load = 0.3 * (np.arange(15) == 5)
     by_load = deflect_loaded(b, jnp.asarray(97.0), jnp.asarray(0.0), load)
-    by_force = jitted()(b, b.x[5], jnp.asarray(0.3))
+    by_force = solver()(b, b.x[5], jnp.asarray(0.3))
     np.testing.assert_allclose(by_load.w, by_force.w, atol=1e-10 * float(by_force.w_C))
     np.testing.assert_allclose(by_load.reaction + load, by_force.reaction, atol=1e-10)
 
@@ -434,7 +454,7 @@ def test_limits_in_closed_form(k):
 
 @pytest.mark.parametrize("end", [0.0, 160.0])
 def test_contact_at_a_clamp(end):
-    got = jitted()(table_1(), jnp.asarray(end), jnp.asarray(1.0))
+    got = solver()(table_1(), jnp.asarray(end), jnp.asarray(1.0))
     assert float(got.w_C) == 0
     np.testing.assert_allclose(got.reaction, 0, atol=1e-15)
 
@@ -444,8 +464,8 @@ def test_units(scale):
     """The same beam with lengths in another unit: stiffness per length rescales, answers too."""
     b = table_1()
     u = beam_of(b.x * scale, b.length * scale, b.EI * scale**2, b.k / scale)
-    one = jitted()(b, jnp.asarray(77.0), jnp.asarray(1.0))
-    two = jitted()(u, jnp.asarray(77.0 * scale), jnp.asarray(1.0))
+    one = solver()(b, jnp.asarray(77.0), jnp.asarray(1.0))
+    two = solver()(u, jnp.asarray(77.0 * scale), jnp.asarray(1.0))
     np.testing.assert_allclose(one.w * scale, two.w, rtol=1e-10, atol=1e-12 * scale)
     np.testing.assert_allclose(one.reaction, two.reaction, rtol=1e-10, atol=1e-13)
     np.testing.assert_allclose(one.w_C * scale, two.w_C, rtol=1e-12)
@@ -458,25 +478,26 @@ def test_units(scale):
 def test_dtype_jit_vmap(split, form, dtype):
     """Plain, jitted and mapped calls agree and keep the dtype."""
     b, one = table_1(dtype=dtype), jnp.asarray(1.0, dtype)
-    s = jnp.asarray([12.0, 20.0, 151.0], dtype)
-    mapped = jax.vmap(jitted(split, form), (None, 0, None))(b, s, one)
-    alone = jitted(split, form)(b, s[1], one)
+    s = np.asarray([12.0, 20.0, 151.0], dtype)
+    mapped = many_of(form, split)(b, s, one)
+    alone = solver(split, form)(b, s[1], one)
     for m, a in zip(mapped, alone, strict=True):
         assert m.dtype == a.dtype == dtype
         if form == "recursion":  # the moment at C is a small one here: three digits less
             tolerance = 1000 * np.finfo(dtype).eps
-            np.testing.assert_allclose(m[1], a, atol=tolerance * float(jnp.max(jnp.abs(a))))
+            np.testing.assert_allclose(m[1], a, atol=tolerance * float(np.max(np.abs(a))))
 
 
 def test_incision():
     """A cut span (EI -> 0) or ring (k -> 0) is a smooth limit, not a special case."""
     b = table_1()
     cut = [
-        beam_of(b.x, b.length, b.EI.at[7].set(1.862 * f), b.k) for f in (1e-4, 1e-6, 1e-9, 1e-12)
+        beam_of(b.x, b.length, np.where(np.arange(16) == 7, 1.862 * f, b.EI), b.k)
+        for f in (1e-4, 1e-6, 1e-9, 1e-12)
     ]
-    got = [jitted()(v, jnp.asarray(61.0), jnp.asarray(1.0)) for v in cut]
+    got = [solver()(v, jnp.asarray(61.0), jnp.asarray(1.0)) for v in cut]
     c = [float(v.w_C) for v in got]
     assert c[0] < c[1] < c[2] < c[3] * (1 + 1e-9)
     assert abs(c[3] / c[2] - 1) < 1e-5
     # Beyond the cut next to nothing arrives.
-    assert float(jnp.max(jnp.abs(got[3].reaction[7:]))) < 1e-9
+    assert float(np.max(np.abs(got[3].reaction[7:]))) < 1e-9

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from jitted import jitted
 from late import late
 
 from jaxtrachea.mechanics.force_law import Law
@@ -28,7 +29,7 @@ def compiled(rounding):
     def run(D, C, a, b, mu):
         return slide_path(D, C, Law(a, b), Coulomb(mu, rounding))
 
-    return jax.jit(run, compiler_options=QUICK)
+    return jitted(run, compiler_options=QUICK)
 
 
 def path(D, C=np.zeros((3, 3)), k_1=0.5, k_3=0.0, mu=MU, dtype="float64", rounding=0.0):  # noqa: B008

@@ -1,6 +1,7 @@
 """Data goes one way: a module imports only from rooms above it, and importing costs nothing."""
 
 import ast
+import functools
 import pathlib
 import subprocess
 import sys
@@ -152,17 +153,22 @@ def level(room, order):
     return found[0]
 
 
+@functools.cache
+def import_statements(source):
+    """Wherever they stand."""
+    statements = (ast.Import, ast.ImportFrom)
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, statements)]
+
+
 def imported(source, package):
-    """Dotted names of everything that `source` imports, wherever it stands."""
-    for node in ast.walk(ast.parse(source)):
+    """Dotted names of everything that `source` imports."""
+    for node in import_statements(source):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             base = package[: len(package) - node.level + 1] if node.level else []
             stem = [*base, *(node.module.split(".") if node.module else [])]
             names = [".".join([*stem, alias.name]) for alias in node.names]
-        else:
-            continue
         yield from names
 
 
@@ -275,28 +281,27 @@ def test_the_walk_sees_a_fault_within_the_scene():
 
 
 def test_import_is_light():
-    """Plots, meshes, the command line and file formats are loaded by those who use them."""
+    """Plots, meshes, the command line and file formats are loaded by those who use them.
+
+    Analyses as well draw, and read and write files, only when they are asked.
+    """
     code = (
         "import sys, jaxtrachea, jaxtrachea.mechanics.press, jaxtrachea.scene.simulation\n"
         "import jaxtrachea.surface.local, jaxtrachea.surface.regions, jaxtrachea.trachea.imported\n"
-        f"print([m for m in {HEAVY!r} if m in sys.modules])"
+        f"print([m for m in {HEAVY!r} if m in sys.modules])\n"
+        "import jaxtrachea.inference.analyses\n"
+        "print([m for m in ('matplotlib', 'h5py', 'blackjax') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.split() == ["[]", "[]"]
 
 
-def test_an_analysis_knows_no_other_and_draws_only_when_asked():
+def test_an_analysis_knows_no_other():
     """Each is a file of its own; one may use what another has found, by its name."""
     folder = PACKAGE / "inference" / "analyses"
     for path in set(folder.glob("*.py")) - {folder / "__init__.py"}:
         names = imported(path.read_text(), ["jaxtrachea", "inference", "analyses"])
         assert not [n for n in names if n.startswith("jaxtrachea.inference.analyses")], path
-    code = (
-        "import sys, jaxtrachea.inference.analyses\n"
-        "print([m for m in ('matplotlib', 'h5py', 'blackjax') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 #: Modules that take a tenth of a second or more to load, beside those of `HEAVY`.
@@ -335,19 +340,29 @@ LOADS = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("fit", "simulate"))) for n in LOADS]
+    "names",
+    [
+        ("--version", "init", "check", "plan"),
+        *(pytest.param((n,), marks=pytest.mark.slow) for n in ("fit", "simulate")),
+    ],
+    ids=" ".join,
 )
-def test_a_command_loads_what_it_needs(name, tmp_path):
-    words, may = LOADS[name]
+def test_a_command_loads_what_it_needs(names, tmp_path):
+    """In one process one after the other, since a later one may load all that those before may."""
     code = (
         "import sys\n"
         "from jaxtrachea.cli.main import main\n"
-        f"sys.argv = ['jaxtrachea', *{list(map(str, words))!r}]\n"
-        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        f"print('loaded', *sorted(m for m in {SLOW!r} if m in sys.modules))"
+        f"for words in {[list(map(str, LOADS[n][0])) for n in names]!r}:\n"
+        "    sys.argv = ['jaxtrachea', *words]\n"
+        "    try:\n        main()\n"
+        "    except SystemExit as end:\n        assert not end.code, end.code\n"
+        f"    print('loaded', *sorted(m for m in {SLOW!r} if m in sys.modules))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
     )
-    loaded = set(done.stdout.splitlines()[-1].split()[1:])
-    assert loaded <= may, loaded - may
+    found = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("loaded ")]
+    for name, loaded in zip(names, found, strict=True):
+        assert set(loaded) <= LOADS[name][1], (name, set(loaded) - LOADS[name][1])
+    for name, other in zip(names, names[1:], strict=False):
+        assert LOADS[name][1] <= LOADS[other][1]

@@ -137,9 +137,13 @@ TIMED = [
 ]
 
 
+#: Two presses on deforming sections are ten seconds of compilation.
+LATE = {"marks": (pytest.mark.slow, pytest.mark.compiling)}
+
+
 @pytest.mark.parametrize("options", TIMED, ids=["line", "parts", "sections"])
 def test_a_level_relaxes_around_any_other(options):
-    """It needs the numbers of its law and a curve's time; at once it is as stiff as 1 + gamma."""
+    """It needs the numbers of its law and a curve's time."""
     level, off = level_of(options), level_of(dataclasses.replace(options, relaxation="off"))
     assert isinstance(level, Relaxing)
     assert level.inner.name == off.name == level.name
@@ -153,6 +157,17 @@ def test_a_level_relaxes_around_any_other(options):
     assert level.admits(curve(time=np.arange(6.0)), SIZE) is None
     aside = curve(phi_c=0.5, direction=(0.8, 0.6), time=np.arange(6.0))
     assert (level.admits(aside, SIZE) is None) == off.off_midline
+    values = {n: jnp.asarray(DEFAULTS[n].value) for n in level.needs(joints=True)}
+    motion = Motion(jnp.asarray(20.0), jnp.array([0.5]), onset=jnp.asarray(0.0))
+    with pytest.raises(ValueError, match="no time"):
+        level.response(GEOMETRY, level.material(values), motion)
+
+
+@pytest.mark.parametrize(
+    "options", [*TIMED[:2], pytest.param(TIMED[2], **LATE)], ids=["line", "parts", "sections"]
+)
+def test_at_once_it_is_as_stiff_as_its_branches_say(options):
+    level, off = level_of(options), level_of(dataclasses.replace(options, relaxation="off"))
     values = {n: jnp.asarray(DEFAULTS[n].value) for n in level.needs(joints=True)}
     D, time = jnp.array([0.5, 0.5, 0.5]), jnp.array([0.0, 0.0, 1e9])
     motion = Motion(jnp.asarray(20.0), D, onset=jnp.asarray(0.0))
@@ -174,8 +189,6 @@ def test_a_level_relaxes_around_any_other(options):
     if level.name == "sections":
         shape = timed.joints / plain.joints
         np.testing.assert_allclose(shape[jnp.isfinite(shape)], 1.0)
-    with pytest.raises(ValueError, match="no time"):
-        level.response(GEOMETRY, level.material(values), motion)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,6 +237,9 @@ def test_a_level_that_wraps_another_needs_no_word_in_the_residual(monkeypatch):
     np.testing.assert_allclose(half[1], whole[1] / 2, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "word", [pytest.param(w, **LATE if w == "sections" else {}) for w in LEVELS]
+)
 def test_a_sample_without_a_solution_has_a_status_and_no_number(word):
     """Off the tube: of every level the same word."""
     level = level_of(options_of(word))

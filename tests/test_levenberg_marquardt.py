@@ -139,13 +139,14 @@ def test_a_blank_start_that_cannot_be_evaluated_costs_infinitely():
     """`iterate` by itself, from a blank point whose cost is 0; one that can has its own cost."""
     valley = Valley(*map(jnp.array, BOXES[0][:3]))
 
+    @jax.jit
     def first(theta):
         return iterate(Tolerances(), valley, initial_state(theta, valley))
 
-    assert valley.blank().cost == 0
-    lost = first(jnp.array([jnp.nan, 0.0]))
+    assert jax.jit(lambda v: v.blank().cost)(valley) == 0
+    lost = first(np.array([np.nan, 0.0]))
     assert (lost.status, lost.point.cost) == (FitStatus.INFEASIBLE_START, jnp.inf)
-    good = first(jnp.array([-1.2, 1.0]))
+    good = first(np.array([-1.2, 1.0]))
     # 100 (1 - 1.44)^2 / 2 + (1 + 1.2)^2 / 2
     assert good.status == RUNNING
     np.testing.assert_allclose(good.point.cost, 9.68 + 2.42, rtol=1e-14)
@@ -187,11 +188,16 @@ def test_a_secant_update_knows_the_step_just_taken(dtype):
     """Afterwards the rest times the step is what the residual's second derivatives make of it."""
     far = jnp.full(4, 100, dtype)
     valley = Valley(-far, far, jnp.ones(4, dtype), brown_dennis)
-    theta = jnp.array([-11, 13, -0.4, 0.2], dtype)
     step = jnp.array([-0.1, 0.05, 0.02, -0.03], dtype)
-    old, new = valley.evaluate(theta), valley.evaluate(theta + step)
+
+    @jax.jit
+    def both(theta):
+        old, new = valley.evaluate(theta), valley.evaluate(theta + step)
+        change = (new.jacobian - old.jacobian).T @ new.value
+        return old, new, valley.cross_gradient(old, new), change
+
+    *given, change = both(np.array([-11, 13, -0.4, 0.2], dtype))
     before = Rest(jnp.eye(4, dtype=dtype), jnp.asarray(False))
-    rest = secant_update(before, old, new, valley.cross_gradient(old, new), step)
-    change = (new.jacobian - old.jacobian).T @ new.value
-    np.testing.assert_allclose(rest.matrix @ step, change, rtol=1e6 * np.finfo(dtype).eps)
-    np.testing.assert_array_equal(rest.matrix, rest.matrix.T)
+    matrix = np.asarray(secant_update(before, *given, step).matrix)
+    np.testing.assert_allclose(matrix @ step, change, rtol=1e6 * np.finfo(dtype).eps)
+    np.testing.assert_array_equal(matrix, matrix.T)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jitted import jitted
 from late import late
 
 from jaxtrachea.mechanics import beam, equilibrium, force_law
@@ -24,9 +25,12 @@ def material(dtype="float64", **changes):
     return Material(**{n: jnp.asarray(v, dtype) for n, v in (VALUES | changes).items()})
 
 
+laws = jitted(local_law, static_argnums=3)
+
+
 @functools.cache
 def run(options):
-    return jax.jit(lambda g, m, s, d, onset: press(g, m, s, d, options, onset=onset))
+    return jitted(lambda g, m, s, d, onset: press(g, m, s, d, options, onset=onset))
 
 
 def pressed(options, dtype="float64", s=44.0, displacement=D, onset=0.0, **changes):
@@ -105,10 +109,10 @@ def test_two_material():
     """On a ring the ring's own law, mid-span the ligament's; `k_3` holds on rings if not given."""
     options, g = Options(local="two-material"), table_1()
     m = material(**MORE)
-    on, off = (local_law(g, m, jnp.asarray(s), options) for s in (50.0, 55.0))
+    on, off = (laws(g, m, jnp.asarray(s), options) for s in (50.0, 55.0))
     np.testing.assert_allclose(on[:2], (0.9, 0.05), rtol=1e-14)
     np.testing.assert_allclose(off[:2], (0.3, 0.02), rtol=1e-14)
-    plain = local_law(g, material(k_1_ring=0.9), jnp.asarray(50.0), options)
+    plain = laws(g, material(k_1_ring=0.9), jnp.asarray(50.0), options)
     np.testing.assert_allclose(plain[:2], (0.9, 0.02), rtol=1e-14)
 
 
@@ -116,10 +120,10 @@ def test_two_material():
 def test_two_material_goes_over_within_half_the_closest_spacing(x):
     """Also where the first or last ring is nearer to an end: 3 of 5 mm off, w = (1 - 0.6^2)^3."""
     g, w = Geometry.create(100.0, x), (1 - 0.36) ** 3
-    law = local_law(g, material(**MORE), jnp.asarray(x[4] + 3), Options(local="two-material"))
+    law = laws(g, material(**MORE), jnp.asarray(x[4] + 3), Options(local="two-material"))
     np.testing.assert_allclose(1 / law.k_1, w / 0.9 + (1 - w) / 0.3, rtol=1e-12)
     for end in (0.0, 100.0):  # 2 mm off a ring, where the tube ends
-        law = local_law(g, material(**MORE), jnp.asarray(end), Options(local="two-material"))
+        law = laws(g, material(**MORE), jnp.asarray(end), Options(local="two-material"))
         off = np.abs(x - end).min()
         w_end = (1 - min(off / 5, 1) ** 2) ** 3
         np.testing.assert_allclose(1 / law.k_1, w_end / 0.9 + (1 - w_end) / 0.3, rtol=1e-12)
@@ -128,7 +132,7 @@ def test_two_material_goes_over_within_half_the_closest_spacing(x):
 def test_two_material_single_ring_has_a_transition():
     """With one ring the transition is measured to the ends: finite, not the infinity of no pair."""
     g = Geometry.create(100.0, [30.0])
-    law = local_law(g, material(**MORE), jnp.asarray(95.0), Options(local="two-material"))
+    law = laws(g, material(**MORE), jnp.asarray(95.0), Options(local="two-material"))
     np.testing.assert_allclose(law[:2], (0.3, 0.02))
     assert law.k_5 is None
 
@@ -183,10 +187,11 @@ def test_units(unit):
 @pytest.mark.parametrize("coupling", ["series", "total"])
 def test_bad_specimen_in_a_batch(coupling):
     """One specimen NaN, one past its fold: flagged; the others keep every bit."""
-    one = jax.jit(jax.vmap(lambda EI, k_3: pressed(Options(coupling=coupling), EI_L=EI, k_3=k_3)))
-    EI, k_3 = jnp.full(4, 1.862), jnp.full(4, 0.001)
-    good, bad = one(EI, k_3), one(EI.at[0].set(jnp.nan), k_3.at[2].set(-1e6))
-    keep = jnp.asarray([1, 3])
+    one = jitted(jax.vmap(lambda EI, k_3: pressed(Options(coupling=coupling), EI_L=EI, k_3=k_3)))
+    EI, k_3, keep = np.full(4, 1.862), np.full(4, 0.001), [1, 3]
+    good = one(EI, k_3)
+    EI[0], k_3[2] = np.nan, -1e6
+    bad = one(EI, k_3)
     for p, q in zip(good, bad, strict=True):
         np.testing.assert_array_equal(p[keep], q[keep])
     assert np.all(bad.status[0, 2:] == PressStatus.NON_FINITE)

@@ -83,7 +83,8 @@ def point_of(study, seed=3):
 
 
 @pytest.mark.parametrize(
-    "kind", [*list(KINDS)[:3], "parts", *late("bonded", "fung", "parts, bonded")]
+    "kind",
+    ["line", "parts", *late("markers", "softening", "bonded", "fung", "parts, bonded")],
 )
 def test_residual_is_that_of_the_press_in_time(kind):
     """In closed form beside `press_in_time` in forward mode, through lift-off."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jitted import jitted
 from late import late
 
 from jaxtrachea.mechanics.beam import Beam, deflect
@@ -34,24 +35,34 @@ def points(s, phi, radius=12.0, dtype="float64"):
     distance = np.full_like(s, radius)
     vertices = np.stack([s, distance * np.cos(phi), distance * np.sin(phi)], axis=1)
     floats = vertices, np.zeros_like(vertices), s, phi, distance
-    vertices, normals, s, phi, distance = (jnp.asarray(v) for v in floats)
+    vertices, normals, s, phi, distance = map(jnp.asarray, floats)
     return Mesh(vertices, jnp.asarray(np.zeros((0, 3), np.int32)), normals, s, phi, distance)
+
+
+def as_arrays(tree):
+    """NumPy arrays as those of JAX, which the types of records ask for."""
+    return jax.tree.map(jnp.asarray, tree)
+
+
+def make_keys(*rows):
+    return regions.Keys(*as_arrays(rows))
 
 
 def random_keys(seed=0, s_c=73.0, dtype="float64", size=1.0, rings=15):
     def draw(*shape, by=1.0):
-        return jnp.asarray(
+        return np.asarray(
             by * size * np.random.default_rng((seed, *shape)).normal(size=shape), dtype
         )
 
-    return regions.clamped(
-        jnp.asarray(s_c, dtype), draw(3), draw(rings, 3), draw(rings, 3, by=2),
+    return clamped(
+        np.asarray(s_c, dtype), draw(3), draw(rings, 3), draw(rings, 3, by=2),
         draw(rings, 3, by=-3), draw(rings, 2, by=0.1), draw(2, by=0.1),
-        clamps=jnp.stack([draw(1, 3)[0], draw(1, 3, by=-1)[0]]),
+        clamps=np.stack([draw(1, 3)[0], draw(1, 3, by=-1)[0]]),
     )  # fmt: skip
 
 
-weigh = jax.jit(regions.weigh, compiler_options=QUICK)
+clamped = jitted(regions.clamped, compiler_options=QUICK)
+weigh = jitted(regions.weigh, compiler_options=QUICK)
 
 
 def surface_of(method):
@@ -62,7 +73,8 @@ def surface_of(method):
     return of
 
 
-OF = {method: jax.jit(surface_of(method), compiler_options=QUICK) for method in METHODS}
+OF = {method: jitted(surface_of(method), compiler_options=QUICK) for method in METHODS}
+deflected = jitted(deflect, compiler_options=QUICK)
 
 
 def motion(method, s, phi, phi_c, keys, geometry=GEOMETRY):
@@ -83,14 +95,14 @@ def test_weights_are_a_partition_of_unity(phi_c, dtype):
     w = weigh(jax.tree.map(cast, BINDING), jnp.asarray(phi_c, dtype))
     eps = np.finfo(dtype).eps
     np.testing.assert_allclose(w.U + w.J + w.V, 1, rtol=4 * eps)
-    assert min(jnp.min(w.U), jnp.min(w.J), jnp.min(w.V)) >= 0
+    assert min(np.min(w.U), np.min(w.J), np.min(w.V)) >= 0
     assert w.J.dtype == jnp.dtype(dtype)
 
 
 def test_no_weights_behind_the_ends():
     """As for the ring itself: no answer, and no lane but this one spoilt."""
-    phi_c = jnp.asarray([0.4, 2.3, -math.pi])
-    w = jax.jit(jax.vmap(regions.weigh, (None, 0)))(BINDING, phi_c)
+    phi_c = np.array([0.4, 2.3, -math.pi])
+    w = jitted(jax.vmap(regions.weigh, (None, 0)))(BINDING, phi_c)
     assert np.all(np.isfinite(w.J[0]))
     for line in (w.U, w.J, w.V):
         assert np.all(np.isnan(line[1:]))
@@ -99,11 +111,11 @@ def test_no_weights_behind_the_ends():
 @pytest.mark.parametrize("method", ["linear", "hermite"])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_translation_is_exact(method, dtype):
-    shift, rows = jnp.asarray([0.3, -1.7, 0.9], dtype), jnp.ones((15, 1), dtype)
-    still = jnp.zeros((15, 2), dtype)
-    keys = regions.clamped(
-        jnp.asarray(73, dtype), shift, *[rows * shift[None]] * 3, still, still[0],
-        clamps=jnp.stack([shift, shift]),
+    shift, rows = np.asarray([0.3, -1.7, 0.9], dtype), np.ones((15, 1), dtype)
+    still = np.zeros((15, 2), dtype)
+    keys = clamped(
+        np.asarray(73, dtype), shift, *[rows * shift[None]] * 3, still, still[0],
+        clamps=np.stack([shift, shift]),
     )  # fmt: skip
     geometry = table_1(dtype)
     at = bind(make_tube(geometry), geometry)
@@ -119,21 +131,21 @@ def test_linear_field_along_the_tube(method, s_c):
     slope, at_A = np.array([0.01, -0.03, 0.02]), np.array([0.1, 0.2, -0.5])
 
     def field(s):
-        return jnp.asarray(at_A + slope * np.asarray(s)[..., None])
+        return np.asarray(at_A + slope * np.asarray(s)[..., None])
 
     nodes = np.asarray(BINDING.nodes)
-    slopes = jnp.asarray(np.tile(slope[1:], (17, 1)))
-    keys = regions.Keys(jnp.asarray(s_c), field(s_c), *[field(nodes)] * 3, slopes, slopes[0])
-    got = OF[method](BINDING, jnp.asarray(0.4), keys)
+    slopes = np.asarray(np.tile(slope[1:], (17, 1)))
+    keys = make_keys(np.asarray(s_c), field(s_c), *[field(nodes)] * 3, slopes, slopes[0])
+    got = OF[method](BINDING, np.asarray(0.4), keys)
     np.testing.assert_allclose(got, field(TUBE.s), atol=1e-13)
 
 
 def test_linear_in_the_angle():
     """Three different rigid lines: linear in phi between them, over the back too."""
     U, J, V = np.array([[1.0, 2, 3], [-1, 0, 5], [4, 4, -2]])
-    rows = [jnp.asarray(np.tile(v, (17, 1))) for v in (J, U, V)]
-    still = jnp.zeros((17, 2))
-    keys = regions.Keys(jnp.asarray(73.0), jnp.asarray(J), *rows, still, still[0])
+    rows = [np.asarray(np.tile(v, (17, 1))) for v in (J, U, V)]
+    still = np.zeros((17, 2))
+    keys = make_keys(np.asarray(73.0), np.asarray(J), *rows, still, still[0])
     phi = np.linspace(-math.pi, math.pi, 61)
     back = 2 * math.pi - ALPHA
     wanted = np.stack(
@@ -152,7 +164,7 @@ def test_linear_in_the_angle():
 def test_key_points_are_met(method, phi_c, s_c):
     keys = random_keys(s_c=s_c)
     if s_c == 70.0:  # C on ring 7: one displacement, one place
-        keys = regions.Keys(
+        keys = make_keys(
             keys.s_c, keys.joints[7], keys.joints, keys.U, keys.V, keys.slopes, keys.slopes[7]
         )
     nodes = np.asarray(BINDING.nodes)
@@ -193,23 +205,23 @@ def test_hermite_is_slope_continuous_along_the_joints():
 @pytest.mark.parametrize("s_c", [73.0, 70.0, 0.5])
 def test_hermite_is_the_beam(s_c):
     """Between rings the beam's own deflection, got from the beam by rings of no stiffness there."""
-    x, s_c = np.asarray(GEOMETRY.ring_positions), jnp.asarray(s_c)
-    force = jnp.asarray(0.2)
+    x, s_c = np.asarray(GEOMETRY.ring_positions), np.asarray(s_c)
+    force = np.asarray(0.2)
 
     def beam(extra):
         at = np.sort(np.concatenate([x, extra]))
-        k = jnp.asarray(np.where(np.isin(at, x), 0.1, 0.0))
-        solved = jax.jit(deflect, compiler_options=QUICK)(
-            Beam(jnp.asarray(at), GEOMETRY.length, jnp.full(len(at) + 1, 1.86), k), s_c, force
+        k = np.asarray(np.where(np.isin(at, x), 0.1, 0.0))
+        solved = deflected(
+            Beam(np.asarray(at), GEOMETRY.length, np.full(len(at) + 1, 1.86), k), s_c, force
         )
         return at, solved
 
     _, main = beam(np.array([]))
-    towards = jnp.asarray([math.cos(0.4), math.sin(0.4)])  # deflection in one plane
-    keys = regions.clamped(
-        s_c, *(jnp.concatenate([jnp.zeros(1), main.w_C * towards]),),
-        jnp.concatenate([jnp.zeros((15, 1)), main.w[:, None] * towards[None]], 1),
-        jnp.zeros((15, 3)), jnp.zeros((15, 3)),
+    towards = np.asarray([math.cos(0.4), math.sin(0.4)])  # deflection in one plane
+    keys = clamped(
+        s_c, *(np.concatenate([np.zeros(1), main.w_C * towards]),),
+        np.concatenate([np.zeros((15, 1)), main.w[:, None] * towards[None]], 1),
+        np.zeros((15, 3)), np.zeros((15, 3)),
         main.theta[:, None] * towards[None], main.theta_C * towards,
     )  # fmt: skip
     at, fine = beam(np.arange(1, 160, 1.7))
@@ -225,9 +237,9 @@ def test_axial_motion_is_linear_from_C_to_the_ends():
     nodes = np.asarray(BINDING.nodes)
     rows = np.zeros((17, 3))
     rows[:, 0] = np.interp(nodes, [0, 73, 160], [0, 1, 0])
-    still = jnp.zeros((17, 2))
-    keys = regions.Keys(
-        jnp.asarray(73.0), jnp.asarray([1.0, 0, 0]), *[jnp.asarray(rows)] * 3, still, still[0]
+    still = np.zeros((17, 2))
+    keys = make_keys(
+        np.asarray(73.0), np.asarray([1.0, 0, 0]), *[np.asarray(rows)] * 3, still, still[0]
     )
     s = np.linspace(0, 160, 97)
     got = motion("hermite", s, 0.4, 0.4, keys)[:, 0]
@@ -251,8 +263,8 @@ def test_phong_interpolates_magnitude_and_angle(sign, at_C):
         return size * (math.cos(angle) * sign * normal(phi) + math.sin(angle) * x)
 
     contact, end = keyed(2.0, at_C, 0.0), keyed(1.0, 0.7, ALPHA)
-    rows = [jnp.asarray(np.tile(v, (17, 1))) for v in (contact, 0 * end, end)]
-    keys = regions.Keys(jnp.asarray(73.0), jnp.asarray(contact), *rows)
+    rows = [np.asarray(np.tile(v, (17, 1))) for v in (contact, 0 * end, end)]
+    keys = make_keys(np.asarray(73.0), np.asarray(contact), *rows)
     got = motion("phong", 42.0, ALPHA / 2, 0.0, keys)[0]
     np.testing.assert_allclose(got, keyed(1.5, (at_C + 0.7) / 2, ALPHA / 2), atol=1e-5)
 
@@ -262,9 +274,9 @@ def test_phong_interpolates_magnitude_and_angle(sign, at_C):
 def test_phong_moves_the_back_of_a_moving_tube_with_it(phi_c, tilt):
     """A tube that moves as a whole, inwards at C or slanting, moves so everywhere: the back too."""
     turn = phi_c + tilt
-    shift = -jnp.array([0.3 * tilt, math.cos(turn), math.sin(turn)])
-    rows = [jnp.tile(shift, (17, 1))] * 3
-    keys = regions.Keys(jnp.asarray(73.0), shift, *rows)
+    shift = -np.array([0.3 * tilt, math.cos(turn), math.sin(turn)])
+    rows = [np.tile(shift, (17, 1))] * 3
+    keys = make_keys(np.asarray(73.0), shift, *rows)
     got = motion("phong", 42.0, np.linspace(-math.pi, math.pi, 61), phi_c, keys)
     np.testing.assert_allclose(got, np.broadcast_to(shift, got.shape), atol=2e-6)  # fade 1 um
 
@@ -281,8 +293,8 @@ def test_phong_on_the_back_of_a_flattened_tube():
         return np.array([0, math.cos(angle), math.sin(angle)])
 
     U, V = size * outward(-ALPHA - b), size * outward(ALPHA + b)
-    rows = [jnp.tile(jnp.asarray(v), (17, 1)) for v in ([0.0, -2.0, 0.0], U, V)]
-    keys = regions.Keys(jnp.asarray(73.0), jnp.array([0.0, -2.0, 0.0]), *rows)
+    rows = [np.tile(np.asarray(v), (17, 1)) for v in ([0.0, -2.0, 0.0], U, V)]
+    keys = make_keys(np.asarray(73.0), np.array([0.0, -2.0, 0.0]), *rows)
     share = np.linspace(0, 1, 21)
     phi = ALPHA + share * 2 * (math.pi - ALPHA)
     angle = phi + b * (1 - 2 * share)
@@ -305,10 +317,10 @@ def test_phong_at_rest_in_float32():
     """Derivatives at rest, and at a joint that hardly moves between others that do: bounded."""
     of = jax.jit(jax.jacrev(surface_of("phong"), (1, 2)), compiler_options=QUICK)
     keys = random_keys(dtype="float32")
-    small = keys.joints.at[7].multiply(1e-9)
-    moving = regions.Keys(keys.s_c, keys.contact, small, keys.U, keys.V)
-    for keys in (jax.tree.map(jnp.zeros_like, moving), moving):
-        for slope in jax.tree.leaves(of(AT32, jnp.asarray(0.4, "float32"), keys)):
+    small = keys.joints * np.where(np.arange(17) == 7, 1e-9, 1).astype("float32")[:, None]
+    moving = make_keys(keys.s_c, keys.contact, small, keys.U, keys.V)
+    for keys in (jax.tree.map(np.zeros_like, moving), moving):
+        for slope in jax.tree.leaves(of(AT32, np.asarray(0.4, "float32"), keys)):
             assert np.max(np.abs(slope)) < 10 / (160 * phong.FADE)
 
 
@@ -321,7 +333,7 @@ def slopes_of(f):
         dots = [jnp.sum(a * b) for a, b in zip(back, jax.tree.leaves(tangent), strict=True)]
         return value, ahead, sum(dots, jnp.zeros(()))
 
-    return jax.jit(both, compiler_options=QUICK)
+    return jitted(both, compiler_options=QUICK)
 
 
 def random_like(tree, seed):
@@ -383,19 +395,19 @@ def test_float32_and_lanes(method):
     got = motion(method, s, phi, 0.4, narrow, table_1("float32"))
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, exact, atol=3e-5 if method == "phong" else 3e-6)
-    both = jax.tree.map(lambda *v: jnp.stack(v), wide, random_keys(seed=5, s_c=20.0))
+    both = jax.tree.map(lambda *v: np.stack(v), wide, random_keys(seed=5, s_c=20.0))
     at = bind(points(s, phi), GEOMETRY)
-    mapped = jax.jit(jax.vmap(surface_of(method), (None, 0, 0)), compiler_options=QUICK)
-    lanes = mapped(at, jnp.asarray([0.4, 0.1]), both)
+    mapped = jitted(jax.vmap(surface_of(method), (None, 0, 0)), compiler_options=QUICK)
+    lanes = mapped(at, np.asarray([0.4, 0.1]), both)
     np.testing.assert_allclose(lanes[0], exact, atol=1e-12)
 
 
 def test_misuse_is_told():
-    weights, keys = regions.weigh(BINDING, jnp.asarray(0.4)), random_keys(rings=3)
+    weights, keys = as_arrays((weigh(BINDING, np.asarray(0.4)), random_keys(rings=3)))
     with pytest.raises(ValueError, match=r"keys have 5 rows; expected 17"):
         regions.interpolate(BINDING, weights, keys)
-    k = random_keys()
-    bare = regions.Keys(k.s_c, k.contact, k.joints, k.U, k.V)
+    k = as_arrays(random_keys())
+    bare = make_keys(k.s_c, k.contact, k.joints, k.U, k.V)
     with pytest.raises(ValueError, match=r"needs slopes and contact_slope"):
         regions.interpolate(BINDING, weights, bare)
     with pytest.raises(ValueError, match=r"count is 5; expected one of 1, 8, 16, 32"):
@@ -409,19 +421,17 @@ def test_one_ring():
     np.testing.assert_allclose(got, [keys.joints[1], keys.contact], atol=1e-13)
 
 
-fit = jax.jit(local.fit, compiler_options=QUICK)
-centres = jax.jit(local.centres, static_argnames="count", compiler_options=QUICK)
-targets = jax.jit(local.targets, compiler_options=QUICK)
-correction = jax.jit(local.correction, compiler_options=QUICK)
-kernel = jax.jit(local._kernel, compiler_options=QUICK)
+fit = jitted(local.fit, compiler_options=QUICK)
+centres = jitted(local.centres, static_argnames="count", compiler_options=QUICK)
+targets = jitted(local.targets, compiler_options=QUICK)
+correction = jitted(local.correction, compiler_options=QUICK)
+kernel = jitted(local._kernel, compiler_options=QUICK)
 
 
 def dent(count, spacing=1.5, reach=5.0, depth=(0.2, -1.0, 0.3), sag=0.0, dtype="float64"):
-    s, phi, radius, spacing, reach = (
-        jnp.asarray(v, dtype) for v in (73, 0.4, 12.0, spacing, reach)
-    )
+    s, phi, radius, spacing, reach = (np.asarray(v, dtype) for v in (73, 0.4, 12.0, spacing, reach))
     at = centres(s, phi, radius, spacing, count)
-    wanted = targets(jnp.asarray(depth, dtype), jnp.full(count, sag, dtype))
+    wanted = targets(np.asarray(depth, dtype), np.full(count, sag, dtype))
     return at, wanted, fit(at, wanted, reach)
 
 
@@ -433,7 +443,7 @@ def test_dent_meets_its_targets(count, reach, dtype):
     at, wanted, found = dent(count, reach=reach, dtype=dtype)
     np.testing.assert_allclose(at[0], [73, 12 * math.cos(0.4), 12 * math.sin(0.4)], rtol=1e-6)
     np.testing.assert_allclose(np.hypot(at[:, 1], at[:, 2]), 12, rtol=1e-6)
-    matrix = np.asarray(kernel(at, at, jnp.asarray(reach, dtype)), float)
+    matrix = np.asarray(kernel(at, at, np.asarray(reach, dtype)), float)
     assert np.linalg.cond(matrix) < 1e3
     got = correction(found, at)
     assert got.dtype == jnp.dtype(dtype)
@@ -538,7 +548,7 @@ def test_shares_of_a_way_are_its_targets(dtype):
 
 def test_vertices_of_a_dent_wider_than_prepared_are_nan():
     chosen = local.runs(TUBE.s, jnp.asarray(1.0))
-    at, wanted, found = dent(8, spacing=2.0, reach=6.0)
+    at, wanted, found = as_arrays(dent(8, spacing=2.0, reach=6.0))
 
     def corrected(chosen):
         none = jnp.zeros_like(TUBE.straight)
@@ -553,25 +563,25 @@ def test_vertices_of_a_dent_wider_than_prepared_are_nan():
 def test_one_centre_is_the_kernel():
     """Wendland's C2 function by hand: psi(1/2) = 3/16."""
     at, wanted, found = dent(1, reach=4.0)
-    got = correction(found, at + jnp.asarray([[2.0, 0, 0]]))
+    got = correction(found, at + np.asarray([[2.0, 0, 0]]))
     np.testing.assert_allclose(got, 3 / 16 * wanted, rtol=1e-12)
 
 
 def test_sag_makes_the_footprint_shallower():
-    got = targets(jnp.asarray([0.0, -2.0, 0]), jnp.asarray([9.0] + [0.5] * 6 + [0] * 9))
+    got = targets(np.asarray([0.0, -2.0, 0]), np.asarray([9.0] + [0.5] * 6 + [0] * 9))
     np.testing.assert_allclose(got[:, 1], [-2] + [-1.5] * 6 + [0] * 9)
-    np.testing.assert_array_equal(targets(jnp.asarray([0.0, -0.3, 0]), jnp.full(16, 0.5))[1:], 0)
+    np.testing.assert_array_equal(targets(np.asarray([0.0, -0.3, 0]), np.full(16, 0.5))[1:], 0)
 
 
 def test_repeated_centres():
     """A twin with the same target changes nothing; with another, they share the mean."""
-    at = jnp.asarray([[0.0, 0, 0], [0, 0, 0], [2, 0, 0]])
-    reach = jnp.asarray(5.0)
-    one = fit(at[1:], jnp.asarray([[1.0, 0, 0], [0, 1, 0]]), reach)
-    two = fit(at, jnp.asarray([[1.0, 0, 0], [1, 0, 0], [0, 1, 0]]), reach)
-    x = jnp.asarray([[0.5, 0.3, 0], [1.5, 0, 1]])
+    at = np.asarray([[0.0, 0, 0], [0, 0, 0], [2, 0, 0]])
+    reach = np.asarray(5.0)
+    one = fit(at[1:], np.asarray([[1.0, 0, 0], [0, 1, 0]]), reach)
+    two = fit(at, np.asarray([[1.0, 0, 0], [1, 0, 0], [0, 1, 0]]), reach)
+    x = np.asarray([[0.5, 0.3, 0], [1.5, 0, 1]])
     np.testing.assert_allclose(correction(two, x), correction(one, x), atol=1e-3)
-    odd = fit(at, jnp.asarray([[1.0, 0, 0], [3, 0, 0], [0, 1, 0]]), reach)
+    odd = fit(at, np.asarray([[1.0, 0, 0], [3, 0, 0], [0, 1, 0]]), reach)
     np.testing.assert_allclose(correction(odd, at)[0, 0], 2, atol=1e-2)
 
 
@@ -599,7 +609,7 @@ def test_dent_gradients(count, depth):
 def test_global_and_local_make_up_the_tool_displacement():
     """The model's sum: C moves by its global part plus d."""
     keys = random_keys()
-    d = jnp.asarray([0.2, -1.0, 0.3])
+    d = np.asarray([0.2, -1.0, 0.3])
     at_C = motion("hermite", 73.0, 0.4, 0.4, keys)[0]
     _, _, found = dent(16)
     here = points(73.0, 0.4).straight

@@ -13,6 +13,7 @@ from run_cli import run
 
 import jaxtrachea
 from jaxtrachea.cli.main import main
+from jaxtrachea.fitting.branch_times import unsampled_time
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.predictions import predictions
@@ -276,6 +277,24 @@ def test_a_file_without_time_is_a_row_of_its_own(tmp_path, monkeypatch, capsys):
     assert 'there is no time, which loading = "record" needs' in " ".join(err.split())
 
 
+def test_a_branch_that_outlasts_the_records_is_no_estimate(read):
+    """The same fit, as if its records had ended at the estimate of tau_2, within its interval."""
+    (curves,) = read.study.curves
+    assert not any(unsampled_time(read, 0, i) for i in range(len(read.study.unknowns[0])))
+    value = {p.name: v for p, v in zip(read.study.free, read.value[0], strict=True)}
+    end = value["tau_1"] * value["tau_ratio_2"]
+    short = [dataclasses.replace(c, time=c.time * (end / c.time[-1])) for c in curves]
+    study = dataclasses.replace(read.study, curves=(tuple(short),))
+    result = dataclasses.replace(read, study=study)
+    for i, parameter in enumerate(study.free):
+        lost = parameter.name in ("gamma_2", "tau_ratio_2")
+        says = unsampled_time(result, 0, i)
+        assert says.startswith("the record is shorter than tau_2: " if lost else ""), says
+        assert bool(says) == lost
+        assert (assess(result, 0, i).verdict == "identifiable") != lost
+
+
+@pytest.mark.slow
 def test_a_record_shorter_than_a_branch_does_not_determine_it():
     """Of 20 records of 3 s, tau_2 is 4 s: gamma_2 and its time are never called identifiable."""
     geometry = jaxtrachea.Geometry.create(160.0, list(np.arange(10.0, 151.0, 10.0)))

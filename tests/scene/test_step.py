@@ -82,14 +82,22 @@ def same(found, expected, tolerance=0.0):
     jax.tree.map(one, found, expected)
 
 
-def test_a_scan_is_the_session(rubbed):
+@pytest.fixture(scope="module")
+def scan(rubbed):
+    """Compiled for 30 steps at a time."""
+    return scanned(*rubbed[:2])
+
+
+def test_a_scan_is_the_session(rubbed, scan):
     """To rounding here, where compilers do not optimise; to the bit in the slow test."""
     scene, material, session = rubbed
-    way = way_of(300)
+    way = [np.split(np.asarray(v), 10) for v in way_of(300)]
     session.reset()
-    end, found = scanned(scene, material)(jt.init_state(scene, material), *way)
-    same(found, stepped(session, *way), 1e-12)
-    same(end, session.state, 1e-12)
+    state = jt.init_state(scene, material)
+    for part in zip(*way, strict=True):
+        state, found = scan(state, *part)
+        same(found, stepped(session, *part), 1e-12)
+    same(state, session.state, 1e-12)
 
 
 @pytest.mark.slow
@@ -188,10 +196,10 @@ def test_the_gradient_through_a_contact_history(effects):
     np.testing.assert_allclose(found, known, rtol=1e-6, atol=1e-6)
 
 
-def test_save_restore_branch(rubbed):
+def test_save_restore_branch(rubbed, scan):
     scene, material, session = rubbed
     way = way_of(60, 2)
-    first, rest = ([v[:30] for v in way], [v[30:] for v in way])
+    first, rest = zip(*(np.split(np.asarray(v), 2) for v in way), strict=True)
     session.reset()
     stepped(session, *first)
     kept = session.state
@@ -205,7 +213,7 @@ def test_save_restore_branch(rubbed):
     same(stepped(branch, *rest), expected)
     assert branch.latency().steps == session.latency().steps
     # What a session has begun, a scan goes on with.
-    same(scanned(scene, material)(kept, *rest)[1], expected, 1e-12)
+    same(scan(kept, *rest)[1], expected, 1e-12)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from jitted import jitted
 from late import late
 
 from jaxtrachea.mechanics.sections.contact import Modal, end_shares, own_deflection
@@ -46,6 +47,9 @@ def element(h, a, c):
     return c / (h**3 * (1 + p)) * np.array(rows)
 
 
+own, shares, side = map(jitted, (own_deflection, end_shares, side_of_contact))
+
+
 def by_elements(x, load, h, a, c):
     """Deflection at x of a beam with both ends held, by a unit force at `load`; its stiffness."""
     places = np.unique([0.0, x, load, h])
@@ -65,16 +69,16 @@ def test_a_span_is_a_beam_of_elements(a, dtype):
     """Own deflection and shape functions of modes that warp; of one that only shears, by hand."""
     h, c = 9.0, 50.0
     warps = np.array([[1.0, 1.0, 1.0, 0.0]], dtype)
-    beam = Modal(jnp.full((1, 4), a, dtype), jnp.full((1, 4), c, dtype), warps)
+    beam = Modal(np.full((1, 4), a, dtype), np.full((1, 4), c, dtype), warps)
     rtol = 1e-9 if dtype == "float64" else 3e-4
     for x, load in [(2.0, 3.5), (6.0, 3.5), (3.5, 3.5), (8.5, 1.0)]:
-        got = np.asarray(own_deflection(*(jnp.asarray(v, dtype) for v in (x, load, h)), beam))
+        got = own(*(np.asarray(v, dtype) for v in (x, load, h)), beam)
         np.testing.assert_allclose(got[0, 0], by_elements(x, load, h, a, c)[0], rtol=rtol)
         shear = min(x, load) * (h - max(x, load)) / h / a
         np.testing.assert_allclose(got[0, 3], shear, rtol=rtol)
         K = by_elements(x, x, h, a, c)[1]
         by_ends = -np.linalg.solve(K[2:4, 2:4], K[2:4][:, [0, 1, 4, 5]])[0]
-        (w_L, r_L), (w_R, r_R) = end_shares(*(jnp.asarray(v, dtype) for v in (x, h)), beam)
+        (w_L, r_L), (w_R, r_R) = shares(*(np.asarray(v, dtype) for v in (x, h)), beam)
         got = [float(v[0, 0]) for v in (w_L, r_L, w_R, r_R)]
         np.testing.assert_allclose(got, by_ends, rtol=10 * rtol, atol=1e-12)
         assert float(r_L[0, 3]) == pytest.approx(0.5 * x * (h - x) / h)  # which `selector` drops
@@ -118,15 +122,19 @@ def brute_force(q, phi, distance):
 PHI = np.array([-3.1, -2.4, -ALPHA, -1.9, -0.7, 0.0, 0.4, 1.3, 2.05, 2.6, np.pi])
 DISTANCE = np.linspace(9.0, 14.0, len(PHI))
 SHAPE = TUBE.radius, TUBE.half_angle
-move = jax.jit(wall_motion)
+move = jitted(wall_motion)
+
+
+@jitted
+def _carried(q, points, *shape):
+    modes = WallModes(q[None], jnp.zeros_like(q)[None])
+    return wall_motion(modes, around(points, *shape), jnp.zeros((), q.dtype), *shape)
 
 
 def carried(q, phi=PHI, distance=DISTANCE, dtype="float64"):
     """Points of one section that no contact presses."""
-    phi, distance, q, *shape = (jnp.asarray(v, dtype) for v in (phi, distance, q, *SHAPE))
-    points = around(gather_points(jnp.zeros_like(phi), phi, distance), *shape)
-    modes = WallModes(q[None], jnp.zeros_like(q)[None])
-    return np.asarray(move(modes, points, jnp.zeros((), dtype), *shape))
+    points = gather_points(*(jnp.asarray(v, dtype) for v in (0 * phi, phi, distance)))
+    return _carried(np.asarray(q, dtype), points, *(np.asarray(v, dtype) for v in SHAPE))
 
 
 @pytest.mark.slow
@@ -162,8 +170,8 @@ def test_many_sections_at_once():
     q, phi_c = jnp.asarray(np.random.default_rng(4).normal(size=(2, 3, 4))), jnp.asarray(0.0)
     s, same = jnp.asarray([0.0, 5.0, 9.0, 5.0]), jnp.full(4, 0.4)
     points, modes = around(gather_points(s, same, same + 11), *SHAPE), WallModes(q, 0.1 * q)
-    run = jax.jit(jax.vmap(lambda m: wall_motion(m, points, phi_c, *SHAPE)))
-    both = np.asarray(run(modes))
+    run = jitted(jax.vmap(lambda m: wall_motion(m, points, phi_c, *SHAPE)))
+    both = run(modes)
     for i in range(2):
         alone = move(jax.tree.map(lambda v, i=i: v[i], modes), points, phi_c, *SHAPE)
         np.testing.assert_allclose(both[i], alone, atol=1e-13)
@@ -176,7 +184,7 @@ def test_where_the_own_deflection_goes():
     x = np.linspace(-3.0, 3.0, 61)
     wanted = np.where(np.abs(x) < np.pi / 3, np.cos(1.5 * x) ** 2, 0)
     for turns in (0, 2 * np.pi):
-        np.testing.assert_allclose(side_of_contact(jnp.asarray(x + turns)), wanted, atol=1e-12)
+        np.testing.assert_allclose(side(x + turns), wanted, atol=1e-12)
 
 
 def pressed(s_c, phi_c, D, s, phi, material=MATERIAL):
