@@ -31,21 +31,21 @@ class Branches(NamedTuple):
 def fading(time, branches: Branches):
     """Steps over relaxation times, (N, B), and what they take of a branch: expm1(-x)."""
     dt = jnp.diff(time, prepend=time[:1])
-    x = _over(dt[:, None], branches.tau[None])
-    return x, _lost(x)
+    x = over(dt[:, None], branches.tau[None])
+    return x, taken_of(x)
 
 
 @jax.custom_jvp
-def _over(dt, tau):
+def over(dt, tau):
     """Steps over relaxation times; where it is 1e154 (float32: 1e19) a branch is 0 anyway."""
     limits = jnp.finfo(tau.dtype)
     return jnp.minimum(dt / jnp.maximum(tau, limits.tiny), math.sqrt(float(limits.max)))
 
 
-@_over.defjvp
+@over.defjvp
 def _over_jvp(primals, tangents):
     """In an order that keeps changes in log tau finite where tau^2 is not."""
-    x, limits = _over(*primals), jnp.finfo(primals[1].dtype)
+    x, limits = over(*primals), jnp.finfo(primals[1].dtype)
     tau = jnp.maximum(primals[1], limits.tiny)
     free = x < math.sqrt(float(limits.max))
     return x, jnp.where(free, (tangents[0] - x * tangents[1]) / tau, 0)
@@ -61,7 +61,7 @@ _EXPM1 = {
 
 
 @jax.custom_jvp
-def _lost(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def taken_of(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """`expm1(-x)` for x >= 0 to an ulp or two: of many numbers several times as quick as XLA's.
 
     -x = n log 2 + r; of r its series, times 2^n. Added to 1.5 times 2^mantissa, a number is rounded
@@ -80,9 +80,9 @@ def _lost(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return power * (series * r) + (power - 1)
 
 
-@_lost.defjvp
-def _lost_jvp(primals, tangents):
-    lost = _lost(*primals)
+@taken_of.defjvp
+def _taken_of_jvp(primals, tangents):
+    lost = taken_of(*primals)
     return lost, -(1 + lost) * tangents[0]
 
 
@@ -109,6 +109,53 @@ def _press(kept, share, h, e, elastic, unilateral: bool):
         return force, elastic, jnp.zeros_like(left), A, jnp.ones_like(A)
     per_A = 1 / A
     return jnp.where(left, 0, force), jnp.where(left, -B * per_A, elastic), left, A, per_A
+
+
+class Carried(NamedTuple):
+    """What a part that relaxes remembers; zeros: it was at rest for ever.
+
+    Attributes:
+        overload: what each branch carries beside the elastic force, N; (B,), of vectors (B, 3).
+        elastic: elastic force of the surface, N; scalar, of vectors (3,).
+    """
+
+    overload: Float[Array, "B *k"]
+    elastic: Float[Array, "*k"]
+
+
+def advance(
+    before: Carried, dt: Float[Array, ""], elastic, branches: Branches, unilateral: bool
+) -> tuple[Carried, Float[Array, "*k"]]:
+    """One step of `filter.relax`: what is remembered after it, and the force, N.
+
+    A vector of a unilateral contact has its inward component first: where that would pull, the tool
+    has left, and all components are those of a surface that recovers by itself.
+
+    Args:
+        before: what is remembered.
+        dt: time of the step, s, not negative.
+        elastic: elastic force of the tool's displacement at its end, N; as `before.elastic`.
+        branches: see `Branches`.
+        unilateral: whether the contact lets go (static).
+    """
+    h, e = before
+    x = over(dt, branches.tau)
+    kept, _, share = factors(x, taken_of(x), branches.gamma)
+    A = 1 + added(share)
+    B = added(E * h[b] - P * e for b, (E, P) in enumerate(zip(kept, share, strict=True)))
+    force, surface = A * elastic + B, elastic
+    if unilateral:
+        left = (force if force.ndim == 0 else force[0]) < 0
+        force, surface = jnp.where(left, 0, force), jnp.where(left, -B / A, elastic)
+    return Carried(pushed(before, kept, share, surface), surface), force
+
+
+def pushed(before: Carried, kept, share, surface) -> Float[Array, "B *k"]:
+    """What each branch carries after a step that ends at this elastic force."""
+    h, e = before
+    return jnp.stack(
+        [E * h[b] + P * (surface - e) for b, (E, P) in enumerate(zip(kept, share, strict=True))]
+    )
 
 
 def _loop(x, lost, elastic, gamma, unilateral: bool = True):
@@ -157,7 +204,7 @@ def bonded_in_parallel(x, lost, elastic, gamma):
 
 def mean_kept(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """(1 - exp(-x)) / x for x >= 0, the mean of what is kept within a step."""
-    return _mean(x, _lost(x))
+    return _mean(x, taken_of(x))
 
 
 def loop_with_derivatives(

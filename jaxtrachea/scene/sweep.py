@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.mechanics.oblique import press_oblique
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.mechanics.ring import on_ring
@@ -97,6 +98,7 @@ def _sweep(
 ) -> Sweep:
     """`sweep`, of arguments that are checked."""
     unlike = set(lacking(scene, material)) - {"axial"}
+    material: Any = long_run(material)
     straight_in = scene.plan.has("skeleton") or scene.plan.has("width")
     flat = straight_in and not scene.plan.second_plane
     kind = "width" if scene.plan.has("width") else scene.plan.options.skeleton
