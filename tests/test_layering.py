@@ -53,7 +53,7 @@ WITHIN = {
         {"configurational"},
         {"assemble", "simulation", "sweep", "anchor"},
         {"held_force", "one_row", "grip"},
-        {"rub"},
+        {"rub", "memory"},
         {"hold"},
         {"step"},
         {"session"},

@@ -1,4 +1,4 @@
-r"""A press that relaxes, continued from what it remembers: samples of a path, or one step of a loop.
+r"""A press that relaxes, continued from what it remembers: a path, or one step of a loop.
 
 `press_in_time` presses a whole record from rest, many of them in lanes. Here the history is a value
 that goes in and comes out, so that a path may be taken in one piece or step by step. Both give the

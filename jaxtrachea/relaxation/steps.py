@@ -119,13 +119,13 @@ class Carried(NamedTuple):
         elastic: elastic force of the surface, N; scalar, of vectors (3,).
     """
 
-    overload: Float[Array, "B *k"]
-    elastic: Float[Array, "*k"]
+    overload: Float[Array, "branches ..."]
+    elastic: Float[Array, "..."]
 
 
 def advance(
     before: Carried, dt: Float[Array, ""], elastic, branches: Branches, unilateral: bool
-) -> tuple[Carried, Float[Array, "*k"]]:
+) -> tuple[Carried, Float[Array, "..."]]:
     """One step of `filter.relax`: what is remembered after it, and the force, N.
 
     A vector of a unilateral contact has its inward component first: where that would pull, the tool
@@ -150,7 +150,7 @@ def advance(
     return Carried(pushed(before, kept, share, surface), surface), force
 
 
-def pushed(before: Carried, kept, share, surface) -> Float[Array, "B *k"]:
+def pushed(before: Carried, kept, share, surface) -> Float[Array, "branches ..."]:
     """What each branch carries after a step that ends at this elastic force."""
     h, e = before
     return jnp.stack(

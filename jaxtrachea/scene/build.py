@@ -5,12 +5,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
+from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.sections.material import (
     FROM_FACTORS,
     SECTION_VALUES,
@@ -19,6 +22,7 @@ from jaxtrachea.mechanics.sections.material import (
     Wall,
     from_wall,
 )
+from jaxtrachea.relaxation import laws
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.declare import PlanError
@@ -86,10 +90,11 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     if spec.tool is not None:
         tool = Tool(_shape(spec.tool, folder, files), spec.tool.friction)
     path = path_of(spec, folder, files, geometry)
+    material = relaxing(spec, material, path)
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
         radius = float(geometry.radius)  # that of the outer wall
-    if (own := level_type(material).thickness(material)) is not None:
+    if (own := level_type(material).thickness(long_run(material))) is not None:
         radius = float(geometry.radius) + float(own) / 2
     try:
         scene = make_scene(
@@ -140,6 +145,21 @@ def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
     if all(name in named for name in (*fitted, *FROM_FACTORS)):
         named["extrapolated"] = 0.0  # nothing is left of the factors
     return dataclasses.replace(wall, **named)
+
+
+def relaxing(spec: SceneSpec, material: AnyMaterial, path: Poses | Presses) -> AnyMaterial:
+    """The material with what [relaxation] says; `power` covers the times of the path."""
+    if spec.relaxation is None:
+        return material
+    span = laws.Span(Options.shortest, Options.longest)
+    if path.time is not None:
+        steps = np.diff(np.asarray(path.time))
+        if (steps > 0).any():
+            span = laws.Span(float(steps[steps > 0].min()), float(steps.sum()))
+    section = spec.relaxation
+    values = {name: jnp.asarray(v) for name, v in section.numbers.items()}
+    made = laws.relaxation(section.branches, values, span, parts=section.apart)
+    return RelaxingMaterial(material, made)
 
 
 def ends_not_given(spec: SceneSpec) -> tuple[str, ...]:
@@ -193,8 +213,8 @@ def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray)
     facts = facts_of(bare, staged.material, Presses(s, phi, spec.sweep.depth * inward))
     bare_effects = dataclasses.replace(
         effects_of(spec), contact_point="auto", friction="off", second_plane="auto", axial="off",
-        end_motion="off", surface="off", dent="off", want_surface=False, want_joints=False,
-        want_ring_ends=False,
+        end_motion="off", surface="off", dent="off", relaxation="off", want_surface=False,
+        want_joints=False, want_ring_ends=False,
     )  # fmt: skip
     try:
         plan = make_plan(facts, bare_effects)
@@ -278,5 +298,5 @@ def _shape(section: ToolSection, folder: Path, files: list[Path]) -> shapes.Shap
     if section.shape == "box":
         return shapes.box(np.asarray(section.size) / 2, rounding)
     path = named_file(folder, section.file or "", "tool.file", files)
-    rows = read_table(path, "tool.file", ("x", "y", "z"), ())
-    return shapes.hull(rows, rounding)
+    found = read_table(path, "tool.file", ("x", "y", "z"), {})
+    return shapes.hull(np.stack(list(found.values()), axis=1), rounding)

@@ -46,7 +46,8 @@ class Grip(NamedTuple):
         after: what the next step begins with.
         touching: the tool is on it.
         way: of the press, see `anchor.press_vector`.
-        solve: from presses (and samples of a force that relaxes) to what they do; None: the program of the plan.
+        solve: from presses, and samples of a force that relaxes, to what they do; None: the program
+            of the plan.
         slip: None: no friction.
         total: slip since it touched, mm; (3,); likewise.
     """

@@ -10,14 +10,18 @@ from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.scene.anchor import Instant, anchor_at, as_approach, first_contact
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.grip import Grip, grip, pick
-from jaxtrachea.scene.rub import rub
 from jaxtrachea.scene.memory import recall
+from jaxtrachea.scene.rub import rub
 from jaxtrachea.scene.stage import Poses, Scene
 from jaxtrachea.trachea.material import Material
 
 
 def hold(
-    scene: Scene, material: Material, state: Any, here: Instant, inside: Bool[Array, "1"],
+    scene: Scene,
+    material: Material,
+    state: Any,
+    here: Instant,
+    inside: Bool[Array, "1"],
     at_rest: History | None = None,
 ) -> tuple[Any, Poses, Approach, Grip]:
     """The next state but for the side; pose and way of the tool on its place; its grip.

@@ -44,7 +44,7 @@ class Moved(NamedTuple):
     where there is no ligament. Of a tool with a width, `slope_C` is the mean of those at its edges,
     each weighed by its force, and `slope_edges` are they; else None. `clamps`: how the ends A and B
     move, None where they do not. `along`: modes of the sections that a surface asks for, and of
-    that at the contact. `history`: what a force that relaxes remembers after the last row; else None.
+    that at the contact. `history`: what a force that relaxes remembers after the last row, or None.
     """
 
     force: Any

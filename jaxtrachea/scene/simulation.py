@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
-from jaxtrachea.mechanics.levels.relaxing import long_run
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.press_history import History, Samples, at_rest
 from jaxtrachea.mechanics.press_in_time import validated
 from jaxtrachea.mechanics.samples import in_order
@@ -141,14 +141,7 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
 def _simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
     """`simulate`, of arguments that are checked."""
     made = approach(scene, path) if isinstance(path, Poses) else None
-    before = None
-    if scene.plan.has("relaxation"):
-        if path.time is None:
-            raise ValueError("path.time is None; the plan has relaxation")
-        vector = scene.plan.second_plane or not scene.plan.mechanics.hangs_on_rings
-        rest = at_rest(material.relaxation, scene.plan.options, vector)
-        before = Before(rest, path.time)
-    result, press = pressed(scene, material, path, made, before=before)
+    result, press = pressed(scene, material, path, made, before=before_path(scene, material, path))
     return result._replace(vertices=surface(scene, path, press), time=path.time)
 
 
@@ -164,6 +157,20 @@ class Before(NamedTuple):
     history: History
     time: Float[Array, " rows"] | None = None
     dt: Float[Array, ""] | None = None
+
+
+def before_path(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Before | None:
+    """Rest, of a force that relaxes; else None.
+
+    Raises:
+        ValueError: a path without times.
+    """
+    if not isinstance(material, RelaxingMaterial) or not scene.plan.has("relaxation"):
+        return None
+    if path.time is None:
+        raise ValueError("path.time is None; expected a time for every row: the plan relaxes")
+    vector = scene.plan.second_plane or not scene.plan.mechanics.hangs_on_rings
+    return Before(at_rest(material.relaxation, scene.plan.options, vector), path.time)
 
 
 class Pressed(NamedTuple):
@@ -207,8 +214,8 @@ def pressed(
     safe, bad = without_negative_values(scene, long_run(material))
     given = path if isinstance(path, Presses) else None
     presses, used, inward, refused = refuse(scene, safe, given, made, bad)
-    timed, history = (), None
-    if before is not None:
+    timed = ()
+    if before is not None and isinstance(material, RelaxingMaterial):
         samples, back = _samples(material.relaxation, before, presses, refused)
         refused = refused | {PressStatus.BACK_IN_TIME: back}
         D = jnp.where(back[:, None], jnp.nan, presses.displacement)

@@ -27,8 +27,8 @@ from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.grip import Slip, pick
 from jaxtrachea.scene.hold import hold
-from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
+from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.one_row import Row
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.rub import no_slip
@@ -106,8 +106,9 @@ def step(
     """Move the tool: the next state, and what happens at this pose.
 
     It does what `Session.step` does. A pose that is not finite is a row of NaN with NON_FINITE and
-    leaves the state as it was, and so does a time that runs back, with BACK_IN_TIME. Scenes of many environments may differ in their arrays (`vmap` over
-    scene, material and state; make the states by `vmap` of `init_state`), not in their plans.
+    leaves the state as it was, and so does a time that runs back, with BACK_IN_TIME. Scenes of many
+    environments may differ in their arrays (`vmap` over scene, material and state; make the states
+    by `vmap` of `init_state`), not in their plans.
 
     Args:
         scene: that the state was made for.
