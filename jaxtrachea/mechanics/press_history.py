@@ -28,7 +28,7 @@ from jaxtrachea.mechanics.relaxation_energy import taken
 from jaxtrachea.mechanics.relaxation_parts import one_sample, way_of
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.relaxation.filter import Relaxation
-from jaxtrachea.relaxation.steps import Branches, Carried, advance, factors, over, taken_of
+from jaxtrachea.relaxation.steps import Branches, Carried, advance, factors, over
 from jaxtrachea.status import PressStatus
 
 
@@ -229,7 +229,7 @@ def _apart(moved, compliance, law: Law, status, options: Options, samples: Sampl
         safe, lost, skipped = _counted(history, D, status, skipped, way(e, y))
         x, x_s = over(dt, local.tau), over(dt, skeleton.tau)
         fading = (
-            factors(x, taken_of(x), local.gamma), factors(x_s, taken_of(x_s), skeleton.gamma)
+            factors(x, jnp.expm1(-x), local.gamma), factors(x_s, jnp.expm1(-x_s), skeleton.gamma)
         )  # fmt: skip
         new, (force, depth, load, folded) = one_sample(
             (h, e, q, y), fading, safe, compliance, law, unilateral

@@ -32,7 +32,7 @@ def fading(time, branches: Branches):
     """Steps over relaxation times, (N, B), and what they take of a branch: expm1(-x)."""
     dt = jnp.diff(time, prepend=time[:1])
     x = over(dt[:, None], branches.tau[None])
-    return x, taken_of(x)
+    return x, _lost(x)
 
 
 @jax.custom_jvp
@@ -61,7 +61,7 @@ _EXPM1 = {
 
 
 @jax.custom_jvp
-def taken_of(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def _lost(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """`expm1(-x)` for x >= 0 to an ulp or two: of many numbers several times as quick as XLA's.
 
     -x = n log 2 + r; of r its series, times 2^n. Added to 1.5 times 2^mantissa, a number is rounded
@@ -80,9 +80,9 @@ def taken_of(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return power * (series * r) + (power - 1)
 
 
-@taken_of.defjvp
-def _taken_of_jvp(primals, tangents):
-    lost = taken_of(*primals)
+@_lost.defjvp
+def _lost_jvp(primals, tangents):
+    lost = _lost(*primals)
     return lost, -(1 + lost) * tangents[0]
 
 
@@ -140,7 +140,7 @@ def advance(
     """
     h, e = before
     x = over(dt, branches.tau)
-    kept, _, share = factors(x, taken_of(x), branches.gamma)
+    kept, _, share = factors(x, jnp.expm1(-x), branches.gamma)
     A = 1 + added(share)
     B = added(E * h[b] - P * e for b, (E, P) in enumerate(zip(kept, share, strict=True)))
     force, surface = A * elastic + B, elastic
@@ -204,7 +204,7 @@ def bonded_in_parallel(x, lost, elastic, gamma):
 
 def mean_kept(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """(1 - exp(-x)) / x for x >= 0, the mean of what is kept within a step."""
-    return _mean(x, taken_of(x))
+    return _mean(x, jnp.expm1(-x))
 
 
 def loop_with_derivatives(

@@ -158,7 +158,7 @@ def _relaxation_keys() -> type[Section]:
 class RelaxationSection(_relaxation_keys()):
     """[relaxation]: how the force relaxes; see `jaxtrachea.relaxation.laws`."""
 
-    branches: laws.Word = "prony-2"
+    branches: Literal["prony-1", "prony-2", "prony-3", "prony-4", "power", "fung"] = "prony-2"
     """law of the relaxation, as in a fit"""
 
     @model_validator(mode="after")
