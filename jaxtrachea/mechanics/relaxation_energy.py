@@ -47,9 +47,9 @@ def energy(
 ) -> Energy:
     """The energy of a press in which all of the organ relaxes alike.
 
-    What is taken is a sum over places within a step: of the right sign, and right where steps are
-    no longer than the relaxation times (within 1e-3 of the peak where the law is steep, in the
-    median of random paths 1e-11).
+    What is taken is a sum over places within a step: of the right sign. Of a linear law it is right
+    within 1e-8 in steps as long as a relaxation time, 4e-4 in ten times longer ones and 2 % in a
+    hundred times longer ones; where the law is steep within 1e-3 of the peak.
 
     Args:
         time: s, never falling.
@@ -100,18 +100,21 @@ def taken(
         elastic: elastic force after it, N: of the surface.
         moved: displacement under an elastic force, mm; of any leading shape.
     """
-    h, e_0 = before
-    per_branch = x.shape[0], *[1] * elastic.ndim
-    x, gamma = x.reshape(per_branch), gamma.reshape(per_branch)
-    places = [(1 + float(place)) / 2 for place in _PLACES]
-    now = jnp.stack([e_0 + at * (elastic - e_0) for at in places])[:, None]
-    carried = [
-        jnp.exp(-at * x) * h + gamma * mean_kept(at * x) * (at * (elastic - e_0)) for at in places
-    ]
-    lag = _behind(now, jnp.stack(carried), gamma)
-    lost = (now - lag) * (moved(now) - moved(lag))
-    weights = jnp.asarray(_WEIGHTS / 2, x.dtype).reshape(-1, *[1] * (elastic.ndim + 1))
-    return jnp.sum(weights * (x * gamma) * lost)
+    ones = [1] * elastic.ndim
+    x, gamma = (v.reshape(1, -1, *ones) for v in (x, gamma))
+    share, weights = (jnp.asarray(v, x.dtype).reshape(-1, 1, *ones) for v in (_PLACES, _WEIGHTS))
+    # Places lie closer where a long step begins, as what was carried fades there.
+    size = jnp.log1p(x)
+    passed = jnp.expm1(size * ((1 + share) / 2))
+    some = x > jnp.finfo(x.dtype).eps
+    at = jnp.where(some, passed / jnp.where(some, x, 1), (1 + share) / 2)
+    taken_there = weights / 2 * size * (1 + passed) * gamma
+    h, start = before.overload[None], before.elastic[None, None]
+    moved_on = at * (elastic - before.elastic)[None, None]
+    now = start + moved_on
+    carried = jnp.exp(-passed) * h + gamma * mean_kept(passed) * moved_on
+    lag = _behind(now, carried, gamma)
+    return jnp.sum(taken_there * (now - lag) * (moved(now) - moved(lag)))
 
 
 def _behind(e, h, gamma):

@@ -257,7 +257,9 @@ def pressed(
     ), press
 
 
-def _samples(relaxation: Relaxation, before: Before, presses: Presses, refused) -> Samples:
+def _samples(
+    relaxation: Relaxation, before: Before, presses: Presses, refused
+) -> tuple[Samples, Bool[Array, " rows"]]:
     """Rows as samples of a force that relaxes, and which of them go back in time."""
     if before.time is not None:
         time, order = in_order(before.time, jnp.sum(presses.displacement, axis=1))
