@@ -366,6 +366,9 @@ def move_tool(
         if after.memory is not None:
             memory = after.memory._replace(press=press.history)
             after, press = dataclasses.replace(after, memory=memory), press._replace(history=None)
+            # A loop has microseconds: what the dashpots take is a sixth of a step.
+            result = result._replace(dissipated=None)
+            press = press._replace(moved=press.moved._replace(dissipated=None))
         if held.total is not None and result.slip is not None:
             total = jnp.where(jnp.isnan(result.slip), jnp.nan, held.total)
             result = result._replace(slip=total)

@@ -193,7 +193,7 @@ def test_steps_are_the_path(held, started):
     found, known = started[2], simulate(scene, material, path)
     first = slice(0, 44)
     np.testing.assert_allclose(found.force[first], known.force[first], atol=1e-12)
-    np.testing.assert_allclose(found.dissipated[first], known.dissipated[first], atol=1e-12)
+    assert found.dissipated is None
     assert np.array_equal(found.status, known.status)
     np.testing.assert_allclose(found.force, known.force, atol=1e-7)  # as without relaxation
     assert float(known.force[-1, 1]) < -0.05  # and it remembers
@@ -246,7 +246,7 @@ def test_another_place_is_at_rest_the_same_is_not(held, started):
         dt[-4:] = 0.01, wait, 0.01, 0.0
         return float(run(started[0], way[0], jnp.asarray(places), jnp.asarray(dt))[1].force[-1, 1])
 
-    fresh, soon, late, other = last(0, 1e6), last(0, 0.01), last(0, 40.0), last(20.0, 0.01)
+    fresh, soon, late, other = last(0, 1e6), last(0, 0.01), last(0, 200.0), last(20.0, 0.01)
     assert soon > 0.8 * fresh  # negative: the wall is not yet back
     np.testing.assert_allclose(late, fresh, rtol=2e-3)
     assert other < 1.1 * soon
