@@ -141,7 +141,7 @@ def respond_in_time(
 
 def press_at_in_time(
     place: Place, displacement: Float[Array, "N 3"], options: Options, samples: Samples
-) -> tuple[ObliquePress, History, Float[Array, " N"]]:
+) -> tuple[ObliquePress, History, Float[Array, " N"] | None]:
     """`oblique.press_at` of a force that relaxes, all parts alike.
 
     Returns:
@@ -212,8 +212,8 @@ def _alike(elastic, depth, law: Law, way, status, options: Options, samples: Sam
         after = _after(history, History(local, None, lost), skipped)
         return after, _row(force, depth, local.elastic, work, status, lost, skipped, unilateral)
 
-    history, rows = _rows(step, samples, elastic, depth, status)
-    return Relaxed(history, *rows)
+    history, (solved, work) = _rows(step, samples, elastic, depth, status)
+    return Relaxed(history, solved, work)
 
 
 def _apart(moved, compliance, law: Law, status, options: Options, samples: Samples) -> Relaxed:
@@ -250,8 +250,8 @@ def _apart(moved, compliance, law: Law, status, options: Options, samples: Sampl
     def way(e, y):
         return _alone(law, e) + compliance * y
 
-    history, rows = _rows(step, samples, moved, status)
-    return Relaxed(history, *rows)
+    history, (solved, work) = _rows(step, samples, moved, status)
+    return Relaxed(history, solved, work)
 
 
 def _rows(step, samples: Samples, *rows):

@@ -43,7 +43,7 @@ def hold(
         state, started=jnp.asarray(True), touching=held.touching, last=here, anchor=held.after,
         slip=held.slip,
     )  # fmt: skip
-    if state.memory is not None:
+    if state.memory is not None and at_rest is not None:
         depth = -here.seen.gap[0]
         kept = recall(scene, state.memory, at_rest, held.anchor, depth, held.touching)
         after = dataclasses.replace(after, memory=kept)

@@ -151,7 +151,8 @@ def _relaxation_keys() -> type[Section]:
     """A key for each number of a law of relaxation."""
     keys: dict[str, Any] = {}
     for name, p in OF_TIME.items():
-        keys[name] = (Annotated[float, quantity(p.dimension, positive=True)] | None, None)
+        number: Any = Annotated[float, quantity(p.dimension, positive=True)]
+        keys[name] = (number | None, None)
     return create_model("RelaxationKeys", __base__=Section, **keys)
 
 

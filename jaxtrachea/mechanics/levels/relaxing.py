@@ -47,8 +47,10 @@ def _as_arrays(given: Relaxation) -> Relaxation:
             )
         return Branches(gamma, tau)
 
-    parts = zip(given._fields, given, strict=True)
-    return Relaxation(*(v if v is None else arrays(f"relaxation.{n}", v) for n, v in parts))
+    skeleton = given.skeleton
+    if skeleton is not None:
+        skeleton = arrays("relaxation.skeleton", skeleton)
+    return Relaxation(arrays("relaxation.local", given.local), skeleton)
 
 
 def long_run(material: Any) -> Any:
