@@ -89,6 +89,12 @@ TABLES = (
         "`file`). They do not mix.",
         spec.PathSection,
     ),
+    (
+        "Scene: [relaxation]",
+        "The numbers of its law, those of the skeleton where it relaxes apart (see "
+        "[parameters](#parameters)), and:",
+        spec.RelaxationSection,
+    ),
     ("Scene: [model]", "", spec.LawSection),
     ("Scene: [plan]", "", spec.PlanSection),
     ("Scene: [output]", "", spec.OutputSection),
@@ -98,6 +104,7 @@ TABLES = (
 TYPES = {
     "PositiveLength": ("length", "mm"),
     "Length": ("length", "mm"),
+    "Duration": ("time", "s"),
     "Stress": ("stress", "MPa"),
     "Bed": ("foundation stiffness", "N/mm^3"),
     "Angle": ("angle", "deg"),

@@ -23,6 +23,7 @@ from .mechanics.force_law import Law as Law
 from .mechanics.force_law import duffing as duffing
 from .mechanics.friction import Coulomb as Coulomb
 from .mechanics.levels.level import Motion as Motion
+from .mechanics.levels.relaxing import RelaxingMaterial as RelaxingMaterial
 from .mechanics.oblique import ObliqueOptions as ObliqueOptions
 from .mechanics.oblique import ObliquePath as ObliquePath
 from .mechanics.oblique import ObliquePress as ObliquePress

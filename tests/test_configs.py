@@ -36,6 +36,7 @@ SHOWS = {
     "no_surface": {"surface": "off", "joints": "off", "second_plane": "off"},
     "normal": {"axial": "off", "rings": "arch2"},
     "off_midline": {"contact": "on", "second_plane": "on", "rings": "arch2"},
+    "relaxation": {"relaxation": "uniform", "contact": "on", "contact_point": "fixed"},
     "right_down": {"axial": "on", "rings": "arch2"},
     "scan": {"contact_point": "per_step", "surface": "off"},
 }
@@ -91,6 +92,7 @@ LATER = {
     "deep",
     "friction",
     "left_down",
+    "relaxation",
     "right_down",
 }
 EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in NAMES]
@@ -229,8 +231,45 @@ k_3 = "0.02 N/mm^3"
 PRESS = '[path]\ns = "75 mm"\ndisplacement = ["0 mm", "-4 mm", "0 mm"]\n'
 LINE = '[path]\nstart = ["75 mm", "19 mm", "0 mm"]\nend = ["75 mm", "16 mm", "0 mm"]\n'
 BALL = '[tool]\nshape = "sphere"\nradius = "5 mm"\n'
+RELAXES = '[relaxation]\nbranches = "prony-1"\ngamma_1 = 0.5\ntau_1 = "2 s"\n'
+TIMED = PRESS + 'duration = "2 s"\n'
+TWO_LEGS = PRESS.replace("[path]", "[[path]]") + TIMED.replace("[path]", "[[path]]")
 #: name -> (scene, what stderr must say: key, what is wrong, the cure)
 BAD = {
+    "relaxation without a time": (
+        GOOD + RELAXES + PRESS,
+        ["effects.relaxation", "no times", "duration", "'off'"],
+    ),
+    "time in the wrong unit": (
+        GOOD + RELAXES + PRESS + 'duration = "2 mm"',
+        ["path.0.duration", "2 mm"],
+    ),
+    "one leg without a time": (GOOD + RELAXES + TWO_LEGS, ["path.0", "no duration", "path.1"]),
+    "one step in time": (GOOD + TIMED + "steps = 1", ["path.0.steps", "at least 2"]),
+    "times that fall": (
+        GOOD + BALL + '[path]\nfile = "falling.csv"',
+        ["falling.csv", "'t'", "row 2", "never fall"],
+    ),
+    "two kinds of time": (
+        GOOD + BALL + '[path]\nfile = "rising.csv"\nduration = "1 s"',
+        ["path.0.duration", "'t'"],
+    ),
+    "number of a law missing": (
+        GOOD + RELAXES.replace("prony-1", "prony-2") + TIMED,
+        ["relaxation", "gamma_2", "give"],
+    ),
+    "number of another law": (
+        GOOD + RELAXES + "beta = 0.2\n" + TIMED,
+        ["relaxation", "beta", "remove"],
+    ),
+    "beta beyond the law": (
+        GOOD + '[relaxation]\nbranches = "power"\ngamma = 1\nbeta = 0.7\n' + TIMED,
+        ["relaxation", "beta is 0.7", "0.05 to 0.4"],
+    ),
+    "parts with no numbers of the skeleton": (
+        GOOD + RELAXES + TIMED + '[effects]\nrelaxation = "parts"',
+        ["effects.relaxation", "skeleton", "uniform"],
+    ),
     "no path": (GOOD, ["path", "missing"]),
     "no material": (PRESS, ["material: missing"]),
     "key mistyped": (GOOD + PRESS + "[efects]\naxial = 'on'", ["efects: unknown key", "effects"]),
@@ -345,6 +384,9 @@ def folder(tmp_path, monkeypatch):
     tube = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
     tube.export(tmp_path / "tube.stl")
     (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n1,0,0\n0,1,0\n0,0,1\n")
+    for name, times in (("falling", (1, 0.5)), ("rising", (0, 0.5))):
+        rows = "".join(f"75,{18 - i},0,{t}\n" for i, t in enumerate(times))
+        (tmp_path / f"{name}.csv").write_text("x [mm],y [mm],z [mm],t [s]\n" + rows)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

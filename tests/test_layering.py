@@ -54,7 +54,7 @@ WITHIN = {
         {"configurational"},
         {"assemble", "simulation", "sweep", "anchor"},
         {"held_force", "one_row", "grip"},
-        {"rub"},
+        {"rub", "memory"},
         {"hold"},
         {"step"},
         {"session"},

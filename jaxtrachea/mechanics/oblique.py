@@ -177,6 +177,14 @@ def _press_oblique(
 
 def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
     """As `press_oblique`, on a place that is known."""
+    force, depth, status = elastic_at(place, displacement, options)
+    refused = place.asked.refused
+    unit, force, depth = mask(refused, place.unit, force, depth)
+    return assemble(unit, force, depth, status_of(refused, status))
+
+
+def elastic_at(place: Place, displacement: Float[Array, "*n 3"], options: Options):
+    """Force, N, and local indentation, mm, (*n, 3), and the status of the press."""
     normal = local_frame(place.phi_c)[0]
     # Rows that are no numbers say nothing of place and onset.
     known = jnp.isfinite(jnp.sum(displacement, axis=-1, keepdims=True))
@@ -200,9 +208,7 @@ def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options)
         pulls = product(force, normal) < 0
         force, depth = (jnp.where(pulls[..., None], jnp.nan, v) for v in (force, depth))
         status = jnp.where(pulls, PressStatus.PULLS, status)
-    refused = place.asked.refused
-    unit, force, depth = mask(refused, place.unit, force, depth)
-    return _assemble(unit, force, depth, status_of(refused, status))
+    return force, depth, status
 
 
 def press_path(
@@ -304,7 +310,7 @@ def _path_of(place: Place, slid: Slide, refused) -> ObliquePath:
     frame = local_frame(place.phi_c)
     unit, slid = mask(refused, place.unit, slid)
     status = status_of(refused, slid.status)
-    press = _assemble(unit, product(slid.force, frame), product(slid.depth, frame), status)
+    press = assemble(unit, product(slid.force, frame), product(slid.depth, frame), status)
     sliding = slid.sliding & (refused == PressStatus.OK)
     return ObliquePath(press, product(slid.slip, frame[1:]), slid.dissipated, sliding)
 
@@ -345,10 +351,19 @@ def _checked(
     return check_place(geometry, material, s_c), phi_c, onset
 
 
-def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
-    """The skeleton's response times the forces; the ring's status where it has one."""
+def assemble(unit: Skeleton, force, depth, status, load=None) -> ObliquePress:
+    """The skeleton's response times the forces; the ring's status where it has one.
 
-    def per_ring(v):
+    Args:
+        unit: -
+        force: of the contact, which the rings bear.
+        depth: local indentation.
+        status: -
+        load: elastic force that the shape follows; None: the force.
+    """
+    load = force if load is None else load
+
+    def per_ring(v, force=load):
         rows = product_of_rows(force.reshape(-1, 3), v.reshape(-1, 3).T)
         return rows.reshape(*force.shape[:-1], *v.shape[:-1])
 
@@ -357,11 +372,11 @@ def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
     return ObliquePress(
         force=force,
         depth=depth,
-        skeleton=product_of_rows(force, unit.compliance.T),
-        slope_C=product_of_rows(force, unit.slope_C.T),
+        skeleton=product_of_rows(load, unit.compliance.T),
+        slope_C=product_of_rows(load, unit.slope_C.T),
         joints=per_ring(unit.joints),
         slopes=per_ring(unit.slopes),
-        loads=per_ring(unit.loads),
+        loads=per_ring(unit.loads, force),
         end_U=per_ring(unit.end_U),
         end_V=per_ring(unit.end_V),
         clamps=per_ring(unit.clamps),

@@ -118,7 +118,7 @@ def _press_in_time(
     elastic = _press.respond(displacement, unit.w_C, contact, options)
     moved = _press.indentation(displacement, onset, options, blend)
     time, order = in_order(motion.time, displacement)
-    relaxation, refused = _validated(relaxation, refused)
+    relaxation, refused = validated(relaxation, refused)
     skipped = order != PressStatus.OK
     solved = _in_time(time, moved, skipped, unit.w_C, law, relaxation, elastic, options)
     status = jnp.where(skipped, order, solved.status)
@@ -126,7 +126,7 @@ def _press_in_time(
     if softening is not None:
         apart = relaxation.skeleton is not None
         way = way_of(solved.load, unit.w_C, law) if apart else moved
-        solved, status = _softened(solved, status, softening, way)
+        solved, status = softened(solved, status, softening, way)
     unit, solved = mask(refused, unit, solved)
     load = solved.load
 
@@ -144,7 +144,7 @@ def _press_in_time(
     )
 
 
-def _softened(solved: Equilibrium, status, softening: Softening, way):
+def softened(solved: Equilibrium, status, softening: Softening, way):
     """The press with the softening of a way; past the fold of that the sample is PAST_FOLD."""
     assert solved.load is not None
     there = jnp.isfinite(solved.force)
@@ -156,7 +156,7 @@ def _softened(solved: Equilibrium, status, softening: Softening, way):
     return solved._replace(force=force, depth=depth, load=load), status
 
 
-def _validated(relaxation: Relaxation, refused):
+def validated(relaxation: Relaxation, refused):
     """The branches, of numbers that cannot be none of them; and why the press is refused."""
     leaves = jax.tree.leaves(relaxation)
     unknown = jnp.any(jnp.stack([jnp.any(jnp.isnan(v)) for v in leaves]))

@@ -144,27 +144,42 @@ def _loop(local, skeleton, displacement, compliance, law: Law, unilateral: bool 
     (x, lost, gamma), (x_s, lost_s, gamma_s) = local, skeleton
 
     def step(state, sample):
-        h, e, q, y = state
         (x, lost), (x_s, lost_s), D = sample
-        kept, _, share = factors(x, lost, gamma)
-        kept_s, _, share_s = factors(x_s, lost_s, gamma_s)
-        A, B = 1 + added(share), _carried(kept, share, h, e)
-        A_s, B_s = 1 + added(share_s), _carried(kept_s, share_s, q, y)
-        solved = law.series(D - compliance * ((B - B_s) / A_s), compliance * (A / A_s))
-        force, new, depth = A * solved.force + B, solved.force, solved.depth
-        if unilateral:
-            left = force < 0
-            alone = jnp.where(left, -B / A, 0)
-            force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
-            depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0.0), depth)
-        load = (force - B_s) / A_s
-        h = tuple(E * h + P * (new - e) for E, P, h in zip(kept, share, h, strict=True))
-        q = tuple(E * q + P * (load - y) for E, P, q in zip(kept_s, share_s, q, strict=True))
-        return (h, new, q, load), (force, depth, load, solved.folded)
+        fading = factors(x, lost, gamma), factors(x_s, lost_s, gamma_s)
+        return one_sample(state, fading, D, compliance, law, unilateral)
 
     zero = jnp.zeros_like(displacement[0])
     start = (zero,) * gamma.shape[0], zero, (zero,) * gamma_s.shape[0], zero
     return jax.lax.scan(step, start, ((x, lost), (x_s, lost_s), displacement))[1]
+
+
+def one_sample(before, fading, displacement, compliance, law: Law, unilateral: bool):
+    """What is remembered after a sample; its force, depth, load and fold.
+
+    Args:
+        before: what the branches of the local law carry, its elastic force, and the same of the
+            skeleton, N.
+        fading: `factors` of the local law, and of the skeleton.
+        displacement: after first touch, mm.
+        compliance: of the skeleton.
+        law: local law.
+        unilateral: static.
+    """
+    h, e, q, y = before
+    (kept, _, share), (kept_s, _, share_s) = fading
+    A, B = 1 + added(share), _carried(kept, share, h, e)
+    A_s, B_s = 1 + added(share_s), _carried(kept_s, share_s, q, y)
+    solved = law.series(displacement - compliance * ((B - B_s) / A_s), compliance * (A / A_s))
+    force, new, depth = A * solved.force + B, solved.force, solved.depth
+    if unilateral:
+        left = force < 0
+        alone = jnp.where(left, -B / A, 0)
+        force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
+        depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0.0), depth)
+    load = (force - B_s) / A_s
+    h = tuple(E * h + P * (new - e) for E, P, h in zip(kept, share, h, strict=True))
+    q = tuple(E * q + P * (load - y) for E, P, q in zip(kept_s, share_s, q, strict=True))
+    return (h, new, q, load), (force, depth, load, solved.folded)
 
 
 def _carried(kept, share, h, e):

@@ -31,21 +31,21 @@ class Branches(NamedTuple):
 def fading(time, branches: Branches):
     """Steps over relaxation times, (N, B), and what they take of a branch: expm1(-x)."""
     dt = jnp.diff(time, prepend=time[:1])
-    x = _over(dt[:, None], branches.tau[None])
+    x = over(dt[:, None], branches.tau[None])
     return x, _lost(x)
 
 
 @jax.custom_jvp
-def _over(dt, tau):
+def over(dt, tau):
     """Steps over relaxation times; where it is 1e154 (float32: 1e19) a branch is 0 anyway."""
     limits = jnp.finfo(tau.dtype)
     return jnp.minimum(dt / jnp.maximum(tau, limits.tiny), math.sqrt(float(limits.max)))
 
 
-@_over.defjvp
+@over.defjvp
 def _over_jvp(primals, tangents):
     """In an order that keeps changes in log tau finite where tau^2 is not."""
-    x, limits = _over(*primals), jnp.finfo(primals[1].dtype)
+    x, limits = over(*primals), jnp.finfo(primals[1].dtype)
     tau = jnp.maximum(primals[1], limits.tiny)
     free = x < math.sqrt(float(limits.max))
     return x, jnp.where(free, (tangents[0] - x * tangents[1]) / tau, 0)
@@ -111,6 +111,53 @@ def _press(kept, share, h, e, elastic, unilateral: bool):
     return jnp.where(left, 0, force), jnp.where(left, -B * per_A, elastic), left, A, per_A
 
 
+class Carried(NamedTuple):
+    """What a part that relaxes remembers; zeros: it was at rest for ever.
+
+    Attributes:
+        overload: what each branch carries beside the elastic force, N; (B,), of vectors (B, 3).
+        elastic: elastic force of the surface, N; scalar, of vectors (3,).
+    """
+
+    overload: Float[Array, "branches ..."]
+    elastic: Float[Array, "..."]
+
+
+def advance(
+    before: Carried, dt: Float[Array, ""], elastic, branches: Branches, unilateral: bool
+) -> tuple[Carried, Float[Array, "..."]]:
+    """One step of `filter.relax`: what is remembered after it, and the force, N.
+
+    A vector of a unilateral contact has its inward component first: where that would pull, the tool
+    has left, and all components are those of a surface that recovers by itself.
+
+    Args:
+        before: what is remembered.
+        dt: time of the step, s, not negative.
+        elastic: elastic force of the tool's displacement at its end, N; as `before.elastic`.
+        branches: see `Branches`.
+        unilateral: whether the contact lets go (static).
+    """
+    h, e = before
+    x = over(dt, branches.tau)
+    kept, _, share = factors(x, jnp.expm1(-x), branches.gamma)
+    A = 1 + added(share)
+    B = added(E * h[b] - P * e for b, (E, P) in enumerate(zip(kept, share, strict=True)))
+    force, surface = A * elastic + B, elastic
+    if unilateral:
+        left = (force if force.ndim == 0 else force[0]) < 0
+        force, surface = jnp.where(left, 0, force), jnp.where(left, -B / A, elastic)
+    return Carried(pushed(before, kept, share, surface), surface), force
+
+
+def pushed(before: Carried, kept, share, surface) -> Float[Array, "branches ..."]:
+    """What each branch carries after a step that ends at this elastic force."""
+    h, e = before
+    return jnp.stack(
+        [E * h[b] + P * (surface - e) for b, (E, P) in enumerate(zip(kept, share, strict=True))]
+    )
+
+
 def _loop(x, lost, elastic, gamma, unilateral: bool = True):
     """Force and elastic force of the surface; arrays may have lanes as their last axis.
 
@@ -157,7 +204,7 @@ def bonded_in_parallel(x, lost, elastic, gamma):
 
 def mean_kept(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """(1 - exp(-x)) / x for x >= 0, the mean of what is kept within a step."""
-    return _mean(x, _lost(x))
+    return _mean(x, jnp.expm1(-x))
 
 
 def loop_with_derivatives(

@@ -11,6 +11,7 @@ from jaxtrachea._arguments import check_fits, check_word
 from jaxtrachea.contact.search import STANDARD
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
+from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.mechanics.sections.wall import Points, gather_points
 from jaxtrachea.scene.declare import PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
@@ -79,7 +80,7 @@ def make_scene(
     shape = jax.tree.map(lambda v: jnp.asarray(v, dtype), tool.shape)
     friction = tool.friction
     kind = level_type(material)
-    own, sections = kind.thickness(material), not kind.hangs_on_rings
+    own, sections = kind.thickness(long_run(material)), not kind.hangs_on_rings
     if radius is None and own is not None:
         outer = geometry.radius + own / 2
     else:

@@ -5,12 +5,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
+from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.sections.material import (
     FROM_FACTORS,
     SECTION_VALUES,
@@ -19,6 +22,7 @@ from jaxtrachea.mechanics.sections.material import (
     Wall,
     from_wall,
 )
+from jaxtrachea.relaxation import laws
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.declare import PlanError
@@ -88,10 +92,11 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         shape, seen = _shape(spec.tool, folder, files)
         tool, notes = Tool(shape, spec.tool.friction), notes + seen
     path = path_of(spec, folder, files, geometry)
+    material = relaxing(spec, material, path)
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
         radius = float(geometry.radius)  # that of the outer wall
-    if (own := level_type(material).thickness(material)) is not None:
+    if (own := level_type(material).thickness(long_run(material))) is not None:
         radius = float(geometry.radius) + float(own) / 2
     try:
         scene = make_scene(
@@ -142,6 +147,21 @@ def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
     if all(name in named for name in (*fitted, *FROM_FACTORS)):
         named["extrapolated"] = 0.0  # nothing is left of the factors
     return dataclasses.replace(wall, **named)
+
+
+def relaxing(spec: SceneSpec, material: AnyMaterial, path: Poses | Presses) -> AnyMaterial:
+    """The material with what [relaxation] says; `power` covers the times of the path."""
+    if spec.relaxation is None:
+        return material
+    span = laws.Span(Options.shortest, Options.longest)
+    if path.time is not None:
+        steps = np.diff(np.asarray(path.time))
+        if (steps > 0).any():
+            span = laws.Span(float(steps[steps > 0].min()), float(steps.sum()))
+    section = spec.relaxation
+    values = {name: jnp.asarray(v) for name, v in section.numbers.items()}
+    made = laws.relaxation(section.branches, values, span, parts=section.apart)
+    return RelaxingMaterial(material, made)
 
 
 def ends_not_given(spec: SceneSpec) -> tuple[str, ...]:
@@ -195,8 +215,8 @@ def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray)
     facts = facts_of(bare, staged.material, Presses(s, phi, spec.sweep.depth * inward))
     bare_effects = dataclasses.replace(
         effects_of(spec), contact_point="auto", friction="off", second_plane="auto", axial="off",
-        end_motion="off", surface="off", dent="off", want_surface=False, want_joints=False,
-        want_ring_ends=False,
+        end_motion="off", surface="off", dent="off", relaxation="off", want_surface=False,
+        want_joints=False, want_ring_ends=False,
     )  # fmt: skip
     try:
         plan = make_plan(facts, bare_effects)
@@ -283,7 +303,8 @@ def _shape(
         return shapes.box(np.asarray(section.size) / 2, rounding), ()
     path = named_file(folder, section.file or "", "tool.file", files)
     if section.shape == "cloud":
-        return shapes.hull(read_table(path, "tool.file", ("x", "y", "z"), ()), rounding), ()
+        points = np.stack(list(read_table(path, "tool.file", ("x", "y", "z"), {}).values()), axis=1)
+        return shapes.hull(points, rounding), ()
     try:
         shape, note = read_tool(path, section.unit, rounding)
     except MeshError as error:

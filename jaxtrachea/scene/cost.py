@@ -26,7 +26,8 @@ def shares(staged: Staged) -> tuple[int, dict[str, float]]:
     if scene.plan.contact:
         moved = jax.eval_shape(simulate, scene, staged.material, staged.path)
         given = jax.tree.map(
-            lambda v: jnp.zeros(v.shape, v.dtype), (moved.s, moved.phi, moved.displacement)
+            lambda v: jnp.zeros(v.shape, v.dtype),
+            (moved.s, moved.phi, moved.displacement, moved.time),
         )
         # Compared without dent, which takes another form without a tool.
         plan = scene.plan.at(dent="off")

@@ -10,6 +10,8 @@ from jaxtrachea._errors import InputError
 
 #: What stands for deforming cross-sections among the values that a material gives.
 SECTIONS = "sections"
+#: The same for branches of its force, and for those of the skeleton alone.
+RELAXES, RELAXES_APART = "relaxation", "relaxation.skeleton"
 
 
 class PlanError(InputError):
@@ -48,6 +50,8 @@ class SceneFacts:
             each), over the radius, where its contact point is fixed.
         way_per_step: the same of a tool whose rows are presses of their own.
         softness: e_1 R and e_2 R^2 of the material, R the radius; 0 where they are not known.
+        timed: whether the path has times.
+        duration: from its first time to its last, s.
     """
 
     poses: bool = False
@@ -65,6 +69,8 @@ class SceneFacts:
     way_fixed: tuple[float, float] = (0.0, 0.0)
     way_per_step: tuple[float, float] = (0.0, 0.0)
     softness: tuple[float, float] = (0.0, 0.0)
+    timed: bool = False
+    duration: float = 0.0
 
 
 class Case(NamedTuple):

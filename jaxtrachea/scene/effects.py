@@ -14,9 +14,18 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene import depth, width
-from jaxtrachea.scene.declare import SECTIONS, Case, Effect, PlanError, Verdict
+from jaxtrachea.scene.declare import (
+    RELAXES,
+    RELAXES_APART,
+    SECTIONS,
+    Case,
+    Effect,
+    PlanError,
+    Verdict,
+)
 from jaxtrachea.surface.regions import Method
 from jaxtrachea.trachea.material import DEEP
 
@@ -158,6 +167,60 @@ def _dent(case: Case) -> Verdict:
     return Verdict("8", reason, refused)
 
 
+def _relaxation(case: Case) -> Verdict:
+    """How the force relaxes, by what the material gives; never dropped without a word."""
+    known, facts = case.facts.known, case.facts
+    if RELAXES not in known:
+        why = "the material does not say how its force relaxes", "give [relaxation], or use 'auto'"
+        return Verdict("off", "the material has no relaxation", {"uniform": why, "parts": why})
+    cannot, apart = _no_history(case), _no_parts(case)
+    both = {"uniform": cannot, "parts": cannot} if cannot else {}
+    if apart and not both:
+        both = {"parts": apart}
+    wished = case.options.relaxation
+    level = "parts" if RELAXES_APART in known else "uniform"
+    if wished == "auto" and level in both:
+        raise PlanError("relaxation", "the force relaxes", *both[level])
+    span = f"over {facts.duration:.3g} s" if facts.timed else "at no time"
+    alike = "local contact and skeleton apart" if level == "parts" else "all parts alike"
+    return Verdict(level, f"the material relaxes, {alike}; {span}", both)
+
+
+def _no_history(case: Case) -> tuple[str, str] | None:
+    """Why no force of this scene can relax, and the cure; None: it can."""
+    or_off = "or set effects.relaxation = 'off' (the force of the long run)"
+    if not case.facts.timed:
+        return (
+            "the path has no times",
+            f"give each [[path]] a duration, or its file a column t, {or_off}",
+        )
+    if case.levels["contact_point"] != "fixed":
+        return (
+            "the contact does not keep its place, and each place has a history of its own",
+            f"shorten the path or set contact_point 'fixed', {or_off}",
+        )
+    if case.levels["friction"] == "on":
+        return (
+            "the tool slides: slip depends on the relaxed force",
+            f"leave tool.friction out, or set friction 'off' and contact_point 'fixed', {or_off}",
+        )
+    return None
+
+
+def _no_parts(case: Case) -> tuple[str, str] | None:
+    """Why parts cannot relax apart, and the cure; None: they can."""
+    or_uniform = "leave the numbers of the skeleton out, or set effects.relaxation = 'uniform'"
+    if RELAXES_APART not in case.facts.known:
+        return "the material does not say how its skeleton relaxes", "give it, or use 'uniform'"
+    if SECTIONS in case.facts.known:
+        return "a wall of deforming cross-sections has no compliance of its own", or_uniform
+    if case.options.coupling != "series":
+        return "with coupling 'total' the force does not depend on the skeleton", or_uniform
+    if case.levels["second_plane"] == "on":
+        return "parts that relax apart are derived for one plane alone", or_uniform
+    return None
+
+
 def _given(name: str) -> Callable[[Case], Verdict]:
     """The rule of an effect that is on wherever the material gives what it reads."""
 
@@ -201,6 +264,8 @@ class EffectOptions:
         width: `punch`: the tool has that of `half_width`; `point`: it has none.
         skeleton: `softening`: it yields more the deeper it is pressed; `sections`: deforming
             cross-sections, of a `SectionMaterial`; see `Options`.
+        relaxation: the force relaxes in time: `uniform`, all parts alike; `parts`, local contact
+            and skeleton apart; see `Options`.
         want_surface: deformed vertices are asked for.
         want_joints: joints and their loads are asked for.
         want_ring_ends: ends of the rings are asked for.
@@ -251,6 +316,10 @@ class EffectOptions:
         depth.skeleton, least="linear", field="options.skeleton", values={},
         material=DEEP, rungs=("linear", "softening"),
     )  # fmt: skip
+    relaxation: Literal["auto", "off", "uniform", "parts"] = _effect(
+        _relaxation, field="options.relaxation", values={}, material=(RELAXES,),
+        rungs=("off", "uniform", "parts"),
+    )  # fmt: skip
     want_surface: bool = True
     want_joints: bool = True
     want_ring_ends: bool = True
@@ -290,10 +359,14 @@ EFFECTS = _declared()
 
 def given_values(material: AnyMaterial) -> frozenset[str]:
     """Optional values that effects read and the material gives; `SECTIONS` of one of sections."""
+    of_time = set()
+    if isinstance(material, RelaxingMaterial):
+        of_time = {RELAXES} if material.relaxation.skeleton is None else {RELAXES, RELAXES_APART}
     if not level_type(material).hangs_on_rings:
-        return frozenset({SECTIONS})
-    names = {name for effect in EFFECTS.values() for name in effect.material}
-    return frozenset(name for name in names if getattr(material, name) is not None)
+        return frozenset({SECTIONS} | of_time)
+    values = long_run(material)
+    names = {name for effect in EFFECTS.values() for name in effect.material} - {RELAXES}
+    return frozenset(of_time | {name for name in names if getattr(values, name) is not None})
 
 
 def goes_with(name: str) -> set[str]:

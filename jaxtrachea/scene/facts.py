@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
+from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.scene.approach import first_touch
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.effects import EffectOptions, given_values
@@ -95,7 +96,9 @@ def facts_of(
         near=_near(scene, np.append(s, place[0]), np.append(phi, place[1])),
         way_fixed=reach(inward, after),
         way_per_step=reach(-gap, outside),
-        softness=_softness(material, radius),
+        softness=_softness(long_run(material), radius),
+        timed=path.time is not None,
+        duration=0.0 if path.time is None else float(np.ptp(np.asarray(path.time, float))),
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrachea.mechanics.oblique import press_at
+from jaxtrachea.mechanics.press_history import Samples
 from jaxtrachea.scene.anchor import (
     Anchor,
     Instant,
@@ -20,7 +21,7 @@ from jaxtrachea.scene.anchor import (
     re_anchor,
     yielded,
 )
-from jaxtrachea.scene.programs import Moved, moved_by
+from jaxtrachea.scene.programs import Moved, moved_by, moved_in_time
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
@@ -45,7 +46,8 @@ class Grip(NamedTuple):
         after: what the next step begins with.
         touching: the tool is on it.
         way: of the press, see `anchor.press_vector`.
-        solve: from presses to what they do; None: the program of the plan.
+        solve: from presses, and samples of a force that relaxes, to what they do; None: the program
+            of the plan.
         slip: None: no friction.
         total: slip since it touched, mm; (3,); likewise.
     """
@@ -54,7 +56,7 @@ class Grip(NamedTuple):
     after: Anchor
     touching: Bool[Array, ""]
     way: Float[Array, "3"]
-    solve: Callable[[Presses], Moved] | None
+    solve: Callable[..., Moved] | None
     slip: Slip | None = None
     total: Float[Array, "3"] | None = None
 
@@ -89,8 +91,10 @@ def grip(
         way = jnp.where(hit, yielded(scene, way, jnp.where(hit, depth, 1), place), way)
         anchor = after = re_anchor(scene, anchor, way, here.path)
 
-    def solve(presses: Presses) -> Moved:
+    def solve(presses: Presses, samples: Samples | None = None) -> Moved:
         assert place is not None
+        if samples is not None:
+            return moved_in_time(place, presses, scene.plan, samples)
         return moved_by(press_at(place, presses.displacement, scene.plan.options), scene.plan)
 
     return Grip(anchor, after, touching, way, None if place is None else solve)

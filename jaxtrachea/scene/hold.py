@@ -6,16 +6,23 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.scene.anchor import Instant, anchor_at, as_approach, first_contact
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.grip import Grip, grip, pick
+from jaxtrachea.scene.memory import recall
 from jaxtrachea.scene.rub import rub
 from jaxtrachea.scene.stage import Poses, Scene
 from jaxtrachea.trachea.material import Material
 
 
 def hold(
-    scene: Scene, material: Material, state: Any, here: Instant, inside: Bool[Array, "1"]
+    scene: Scene,
+    material: Material,
+    state: Any,
+    here: Instant,
+    inside: Bool[Array, "1"],
+    at_rest: History | None = None,
 ) -> tuple[Any, Poses, Approach, Grip]:
     """The next state but for the side; pose and way of the tool on its place; its grip.
 
@@ -25,6 +32,7 @@ def hold(
         state: a `step.State`.
         here: the tool now.
         inside: it is in the lumen.
+        at_rest: history of nothing, of a force that relaxes.
     """
     hit = (here.seen.gap[0] < 0) & ~inside[0]
     last = pick(state.started, state.last, here)
@@ -35,4 +43,8 @@ def hold(
         state, started=jnp.asarray(True), touching=held.touching, last=here, anchor=held.after,
         slip=held.slip,
     )  # fmt: skip
+    if state.memory is not None and at_rest is not None:
+        depth = -here.seen.gap[0]
+        kept = recall(scene, state.memory, at_rest, held.anchor, depth, held.touching)
+        after = dataclasses.replace(after, memory=kept)
     return after, rest, made, held

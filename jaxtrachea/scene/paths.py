@@ -1,6 +1,7 @@
 """The path of a scene, from its tables and from CSV files."""
 
 import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -18,6 +19,8 @@ from jaxtrachea.units import UnitError, column_unit, convert
 STEPS = 10
 #: Longest table of points or poses that is read.
 MAX_BYTES = 64 * 2**20
+#: A unit of each dimension that a table has, for messages.
+EXAMPLE = {"length": "mm", "angle": "deg", "time": "s"}
 #: Meshes that scenes of `configs/` name, and where they come from.
 MESHES = {
     "meshes/trachea.glb": "3D Reference Organ for Trachea, Male v1.0 (GLB, CC BY 4.0), "
@@ -43,9 +46,43 @@ def path_of(
         reach = 0.0 if spec.effects.width == "point" else spec.model.half_width
         return _presses(spec.path, geometry, reach)
     legs = [_leg(leg, i, folder, files) for i, leg in enumerate(spec.path)]
-    translation, vectors = (np.concatenate(v) for v in zip(*legs, strict=True))
+    *found, own = zip(*legs, strict=True)
+    translation, vectors = (np.concatenate(v) for v in found)
     turn = jax.vmap(lambda v: pose_from_vector(v, jnp.zeros_like(v)).rotation)
-    return Poses(turn(jnp.asarray(vectors)), jnp.asarray(translation))
+    time = _times(spec.path, [len(v) for v in found[0]], own)
+    return Poses(turn(jnp.asarray(vectors)), jnp.asarray(translation), time)
+
+
+def _times(
+    legs: list[PathSection], rows: list[int], own: Sequence[np.ndarray | None]
+) -> np.ndarray | None:
+    """Time of every row, s; None: no leg has any.
+
+    Args:
+        legs: -
+        rows: of each leg.
+        own: times that a file gives, from the end of the leg before on.
+
+    Raises:
+        SpecError: a leg without a time beside others that have one, or with two.
+    """
+    timed = [leg.duration is not None or t is not None for leg, t in zip(legs, own, strict=True)]
+    if not any(timed):
+        return None
+    if not all(timed):
+        i, other = timed.index(False), timed.index(True)
+        raise SpecError(f"path.{i}: no duration; expected one, as path.{other} has its time")
+    found, end = [], 0.0
+    for i, (leg, count, t) in enumerate(zip(legs, rows, own, strict=True)):
+        if t is not None and leg.duration is not None:
+            raise SpecError(f"path.{i}.duration: its file has a column 't'; remove one of them")
+        if t is None:
+            assert leg.duration is not None
+            share = np.linspace(0, 1, count) if count > 1 else np.ones(1)
+            t = leg.duration * share
+        found.append(end + t)
+        end = float(found[-1][-1])
+    return np.concatenate(found)
 
 
 def _presses(legs: list[PathSection], geometry: Geometry, reach: float) -> Presses:
@@ -69,25 +106,54 @@ def _presses(legs: list[PathSection], geometry: Geometry, reach: float) -> Press
         s += [at] * steps
         phi += [angle] * steps
         whole = np.asarray(leg.displacement)
-        D += [whole * (k + 1) / steps for k in range(steps)]
-    return Presses(np.array(s), np.array(phi), np.array(D))
+        if leg.duration is None:
+            D += [whole * (k + 1) / steps for k in range(steps)]
+        else:
+            _check_steps(steps, i)
+            same = i > 0 and (leg.s, leg.phi) == (legs[i - 1].s, legs[i - 1].phi)
+            D += list(np.linspace(D[-1] if same else 0 * whole, whole, steps))
+    time = _times(legs, [leg.steps or STEPS for leg in legs], [None] * len(legs))
+    return Presses(np.array(s), np.array(phi), np.array(D), time)
 
 
 def _leg(leg: PathSection, i: int, folder: Path, files: list[Path]):
-    """Translations and rotation vectors of one leg."""
+    """Translations, rotation vectors and times of one leg; None: it has no times of its own."""
     if leg.kind == "file":
-        path = named_file(folder, leg.file or "", f"path.{i}.file", files)
-        rows = read_table(path, f"path.{i}.file", ("x", "y", "z"), ("rx", "ry", "rz"))
-        return rows[:, :3], rows[:, 3:]
+        return _leg_of_file(leg, f"path.{i}.file", folder, files)
     if leg.kind == "line":
         steps = leg.steps or STEPS
-        if steps < 2:
-            raise SpecError(f"path.{i}.steps: {steps}; expected at least 2, the start and the end")
+        _check_steps(steps, i)
         places = np.linspace(np.asarray(leg.start), np.asarray(leg.end), steps)
     else:
         places = np.asarray(leg.positions)
     turn = np.asarray(leg.rotation or [0.0, 0.0, 0.0])
-    return places, np.broadcast_to(turn, places.shape)
+    return places, np.broadcast_to(turn, places.shape), None
+
+
+def _leg_of_file(leg: PathSection, key: str, folder: Path, files: list[Path]):
+    """The same, of a CSV file.
+
+    Raises:
+        SpecError: as `read_table`; times that fall.
+    """
+    path = named_file(folder, leg.file or "", key, files)
+    angles = ("rx", "ry", "rz")
+    found = read_table(path, key, ("x", "y", "z"), dict.fromkeys(angles, "angle") | {"t": "time"})
+    zero, t = np.zeros_like(found["x"]), found.get("t")
+    if t is not None and (np.diff(t, prepend=0) < 0).any():
+        row = int(np.argmax(np.diff(t, prepend=0) < 0))
+        before = f"{t[row - 1]:g} s in the row before" if row else "the beginning, 0 s"
+        raise SpecError(
+            f"{key}: {path.name}, column 't': {t[row]:g} s in row {row + 1} below the header, "
+            f"after {before}; expected times that never fall"
+        )
+    places = np.stack([found[name] for name in "xyz"], axis=1)
+    return places, np.stack([found.get(name, zero) for name in angles], axis=1), t
+
+
+def _check_steps(steps: int, i: int) -> None:
+    if steps < 2:
+        raise SpecError(f"path.{i}.steps: {steps}; expected at least 2, the start and the end")
 
 
 def named_file(folder: Path, name: str, key: str, files: list[Path]) -> Path:
@@ -118,9 +184,15 @@ def _source(name: str) -> str:
 
 
 def read_table(
-    path: Path, key: str, needed: tuple[str, ...], optional: tuple[str, ...]
-) -> np.ndarray:
-    """Columns of a CSV file with units in its header; optional columns that lack are 0.
+    path: Path, key: str, needed: tuple[str, ...], optional: Mapping[str, str]
+) -> dict[str, np.ndarray]:
+    """Columns of a CSV file with units in its header, by name.
+
+    Args:
+        path: of the file.
+        key: that names it.
+        needed: lengths, mm.
+        optional: dimension of those that may lack.
 
     Raises:
         SpecError: with the key that names the file.
@@ -140,24 +212,23 @@ def read_table(
         )
     if len(rows) < 2:
         raise SpecError(f"{key}: {path.name} has no rows; expected at least one")
-    columns = []
-    for name in (*needed, *optional):
+    columns = {}
+    for name, dimension in (dict.fromkeys(needed, "length") | dict(optional)).items():
         if name not in names:
-            columns.append(np.zeros(len(rows) - 1))
             continue
-        at, dimension = names.index(name), "length" if name in needed else "angle"
+        at = names.index(name)
         unit = heads[at][1]
         try:
             if unit is None:
-                raise UnitError(f"no unit; write {name} [{'mm' if name in needed else 'deg'}]")
+                raise UnitError(f"no unit; write {name} [{EXAMPLE[dimension]}]")
             values = convert(np.array([_cell(row, at, i) for i, row in enumerate(rows[1:], 1)]),
                              unit, dimension)  # fmt: skip
         except ValueError as error:
             raise SpecError(f"{key}: {path.name}, column {name!r}: {error}") from None
         if not np.isfinite(values).all():
             raise SpecError(f"{key}: {path.name}, column {name!r}: expected finite numbers")
-        columns.append(values)
-    return np.stack(columns, axis=1)
+        columns[name] = values
+    return columns
 
 
 def _cell(row: list[str], at: int, number: int) -> float:

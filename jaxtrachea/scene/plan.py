@@ -120,6 +120,7 @@ class Plan:
                 cure="a width is for presses straight in on the midline",
             )  # fmt: skip
         self._check_skeleton()
+        self._check_relaxation()
         wanders = self.contact and self.contact_point == "per_step"
         if wanders and self.options.split == "independent":
             raise InputError(
@@ -157,6 +158,27 @@ class Plan:
                 joint=" ", expected="contact_point 'fixed', or presses at given points",
             )  # fmt: skip
 
+    def _check_relaxation(self) -> None:
+        """Refuse a force that relaxes where it has no history.
+
+        Raises:
+            InputError: naming the effect.
+        """
+        if not self.has("relaxation"):
+            return
+        level, found = self.options.relaxation, ""
+        if self.contact_point != "fixed":
+            found, cure = "contact_point 'per_step'", "each place has a history of its own"
+        elif self.friction:
+            found, cure = "friction 'on'", "slip depends on the relaxed force"
+        elif level == "parts" and self.second_plane:
+            found, cure = "second_plane 'on'", "choose 'uniform'"
+        if found:
+            raise InputError(
+                f"is {level!r}, with {found}", key="options.relaxation", joint=" ",
+                expected="'off'", cure=cure,
+            )  # fmt: skip
+
     @property
     def mechanics(self) -> Level:
         """The level of the mechanics that the options ask for."""
@@ -165,7 +187,8 @@ class Plan:
     @property
     def oblique(self) -> ObliqueOptions:
         """What presses as vectors include."""
-        return ObliqueOptions(self.options, rings=self.rings, axial=self.axial)
+        elastic = dataclasses.replace(self.options, relaxation="off")
+        return ObliqueOptions(elastic, rings=self.rings, axial=self.axial)
 
     def level(self, name: str) -> str:
         """The level of an effect."""

@@ -8,7 +8,13 @@ import jax.numpy as jnp
 from jaxtrachea._numerics import scaled
 from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
-from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
+from jaxtrachea.mechanics.oblique import (
+    ObliquePress,
+    Place,
+    place_at,
+    press_oblique,
+    press_path,
+)
 from jaxtrachea.mechanics.press import (
     Contact,
     ligament_beam,
@@ -16,6 +22,12 @@ from jaxtrachea.mechanics.press import (
     respond,
     softening_of,
     unit_deflection,
+)
+from jaxtrachea.mechanics.press_history import (
+    Samples,
+    press_at_in_time,
+    relax_forces,
+    respond_in_time,
 )
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
@@ -32,7 +44,7 @@ class Moved(NamedTuple):
     where there is no ligament. Of a tool with a width, `slope_C` is the mean of those at its edges,
     each weighed by its force, and `slope_edges` are they; else None. `clamps`: how the ends A and B
     move, None where they do not. `along`: modes of the sections that a surface asks for, and of
-    that at the contact.
+    that at the contact. `history`: what a force that relaxes remembers after the last row, or None.
     """
 
     force: Any
@@ -50,6 +62,7 @@ class Moved(NamedTuple):
     slope_edges: Any = None
     clamps: Any = None
     along: Any = None
+    history: Any = None
 
 
 def moved_by(press: ObliquePress, plan: Plan) -> Moved:
@@ -58,7 +71,9 @@ def moved_by(press: ObliquePress, plan: Plan) -> Moved:
     return moved if plan.end_motion else moved._replace(clamps=None)
 
 
-def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
+def one_plane(
+    scene: Scene, material: Material, presses: Presses, samples: Samples | None = None
+) -> Moved:
     """Normal press on the midline: scalars, then spread to vectors.
 
     What moves with the skeleton follows the force, or the load under which a skeleton that softens
@@ -72,14 +87,17 @@ def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
         unit = unit_deflection(beam, s_c, plan.options)
         law = local_law(geometry, material, s_c, plan.options)
         contact = Contact(law, jnp.zeros_like(s_c), softening=softening)
-        return unit, respond(inward, unit.w_C, contact, plan.options)
+        if samples is None:
+            return unit, respond(inward, unit.w_C, contact, plan.options), None
+        relaxed = respond_in_time(inward, unit.w_C, contact, plan.options, samples)
+        return unit, relaxed.solved, relaxed
 
-    inward = -presses.displacement[:, 1]
+    inward, relaxed = -presses.displacement[:, 1], None
     if plan.contact_point == "fixed":
-        unit, solved = at(presses.s[0], inward)
+        unit, solved, relaxed = at(presses.s[0], inward)
         unit = jax.tree.map(lambda v: jnp.broadcast_to(v, (inward.shape[0], *v.shape)), unit)
     else:
-        unit, solved = jax.vmap(at)(presses.s, inward)
+        unit, solved, _ = jax.vmap(at)(presses.s, inward)
     F = -solved.force  # along y
     load = F if solved.load is None else -solved.load
     pairs = (load, unit.w), (F, unit.reaction)
@@ -94,6 +112,8 @@ def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
         skeleton=_anterior(scaled(load, unit.w_C)), slope_C=slope(scaled(load, unit.theta_C)),
         joints=joints, slopes=slope(scaled(load[:, None], unit.theta)),
         loads=bears, end_U=joints, end_V=joints, status=solved.status, slope_edges=edges,
+        dissipated=None if relaxed is None else relaxed.dissipated,
+        history=None if relaxed is None else relaxed.history,
     )  # fmt: skip
 
 
@@ -102,7 +122,9 @@ def _anterior(v):
     return jnp.stack([jnp.zeros_like(v), v, jnp.zeros_like(v)], -1)
 
 
-def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
+def vectors(
+    scene: Scene, material: Material, presses: Presses, samples: Samples | None = None
+) -> Moved:
     """Presses in any direction, anywhere on the rings."""
     plan = scene.plan
     fixed = scene.geometry, material
@@ -116,6 +138,9 @@ def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
         return moved_by(path.press, plan)._replace(slip=path.slip, dissipated=path.dissipated)
     if plan.contact_point == "fixed":
         at = presses.s[0], presses.phi[0], presses.displacement
+        if samples is not None:
+            place = place_at(*fixed, *at[:2], plan.oblique)
+            return moved_in_time(place, presses, plan, samples)
         return moved_by(press_oblique(*fixed, *at, plan.oblique), plan)
 
     def one(s, phi, D):
@@ -124,11 +149,28 @@ def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
     return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement), plan)
 
 
-def move(scene: Scene, material: Any, presses: Presses) -> Moved:
-    """Force and skeleton by the program of the scene's plan."""
+def moved_in_time(place: Place, presses: Presses, plan: Plan, samples: Samples) -> Moved:
+    """The same of a force that relaxes, at one place."""
+    press, history, work = press_at_in_time(place, presses.displacement, plan.options, samples)
+    return moved_by(press, plan)._replace(dissipated=work, history=history)
+
+
+def move(scene: Scene, material: Any, presses: Presses, samples: Samples | None = None) -> Moved:
+    """Force and skeleton by the program of the scene's plan; `samples`: of a force that relaxes."""
     if not scene.plan.mechanics.hangs_on_rings:
-        return cross_sections(scene, material, presses)
+        moved = cross_sections(scene, material, presses)
+        if samples is None:
+            return moved
+        force, status, history = relax_forces(moved.force, moved.status, samples)
+        lost = jnp.isnan(force[:, 0])
+        shape = jax.tree.map(
+            lambda v: jnp.where(lost.reshape(-1, *[1] * (v.ndim - 1)), jnp.nan, v),
+            moved._replace(force=None, status=None),
+        )
+        return shape._replace(force=force, status=status, history=history)
     solve = vectors if scene.plan.second_plane else one_plane
+    if samples is not None:
+        return solve(scene, material, presses, samples)
     return fuse(lambda presses: solve(scene, material, presses))(presses)
 
 

@@ -132,7 +132,7 @@ def status_of(status, share, made: Approach | None, refused: dict[PressStatus, B
             seen = jnp.maximum(seen, made.seen.status[made.first])
         unsure = (seen > ContactStatus.FLAT) & (status == PressStatus.OK)
         status = jnp.where(unsure, PressStatus.CONTACT_UNCERTAIN, status)
-    for code in REFUSALS:
+    for code in (*REFUSALS, PressStatus.BACK_IN_TIME):
         if code in refused:
             status = jnp.where(refused[code], code, status)
     return status.astype(jnp.int8)

@@ -18,7 +18,7 @@ SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 1
 
 #: Unit of every series; what is not named is in mm.
 UNITS = {"phi": "rad", "force": "N", "loads": "N", "moment": "N mm", "dissipated": "N mm",
-         "status": "1", "depth_share": "1", "contact_share": "1"}  # fmt: skip
+         "time": "s", "status": "1", "depth_share": "1", "contact_share": "1"}  # fmt: skip
 
 
 def plan_rows(plan: Plan, shares: dict[str, float]) -> list[list[str]]:
@@ -57,11 +57,12 @@ def write_simulation(
 
 def write_forces(path: Path, out: Simulation) -> None:
     """A row of numbers for each row of a simulation, as CSV (docs/simulate.md)."""
-    names = {"s": ("s_mm",), "phi": ("phi_rad",), "gap": ("gap_mm",)}
+    names = {"time": ("time_s",), "s": ("s_mm",), "phi": ("phi_rad",), "gap": ("gap_mm",)}
     names |= {
         name: tuple(f"{name}_{axis}_{unit}" for axis in "xyz")
         for name, unit in (("displacement", "mm"), ("force", "N"), ("skeleton", "mm"))
     }
+    names["dissipated"] = ("dissipated_N_mm",)
     columns: dict[str, np.ndarray] = {}
     for name, heads in names.items():
         if (value := getattr(out, name)) is not None:

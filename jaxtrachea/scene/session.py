@@ -16,16 +16,19 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.contact.pose import check_rotations, is_rotation
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.validation import check_alike
 from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.held_force import HeldForce, held_force, next_force, no_force
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.simulation import Simulation
-from jaxtrachea.scene.stage import Scene, check_material
+from jaxtrachea.scene.stage import Scene, check_kind, check_material
 from jaxtrachea.scene.step import (
+    NO_TIME,
     Numbers,
     State,
     changeable,
@@ -34,8 +37,9 @@ from jaxtrachea.scene.step import (
     init_state,
     origin_of,
 )
-from jaxtrachea.trachea.material import Material
 
+#: For what a compiled session cannot take.
+CURE = "make a new Session"
 #: Borders of the histogram of latencies, s: four a decade from 10 us to 1 s.
 EDGES = np.logspace(-5, 0, 21)
 
@@ -70,6 +74,10 @@ class Session:
     continuous in the pose. A pose that is not finite is a row of NaN with NON_FINITE and changes
     nothing else.
 
+    A force that relaxes is that of the place: its history goes on while the tool holds the place,
+    slides with it or has lifted off, and is forgotten where the tool grasps anew further away than
+    its dent is wide (`scene.memory`). That is exact as long as the place does not move.
+
     Material and tool are arguments of the program: `set_material` and `set_tool` compile nothing.
 
     Threads may share a session: its calls come one after the other. Results last as long as they
@@ -85,13 +93,16 @@ class Session:
         dtype: of poses.
     """
 
-    def __init__(self, scene: Scene, material: AnyMaterial, *, keep: int = 10_000):
+    def __init__(
+        self, scene: Scene, material: AnyMaterial, *, keep: int = 10_000, stiffness: bool = False
+    ):
         """Compile.
 
         Args:
             scene: from `make_scene` with a path of `Poses`.
             material: as the plan needs it.
             keep: latencies of so many last steps are kept.
+            stiffness: whether results have `Simulation.stiffness`, as in `step`.
 
         Raises:
             ValueError: a scene without contact or with deforming cross-sections; a material that
@@ -100,7 +111,7 @@ class Session:
         if keep < 1:
             raise ValueError(f"keep is {keep}; expected at least 1")
         check_scene(scene, material)
-        self.scene, self.material = scene, material
+        self.scene, self.material, self._stiffness = scene, material, stiffness
         self.dtype = np.dtype(scene.footprint.dtype)
         self._seconds, self._steps = np.zeros(keep), 0
         self._last_force = no_force(self.dtype)
@@ -110,20 +121,27 @@ class Session:
     def _compile(self) -> None:
         """The program of a step, and its first state."""
         given, state = changeable(self.scene, self.material), init_state(self.scene, self.material)
-        row = Numbers(self.scene, given, state)
+        row = Numbers(self.scene, given, state, stiffness=self._stiffness)
+        self._timed = self.scene.plan.has("relaxation")
         self._given, self._states = row.given, row.states
         self._kept, self._filled = given, row.given.fill(given)
         self._numbers = jax.device_put(self._filled.copy())
         self._start = row.states.fill(state)
         pose = np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype)
+        pose += (np.zeros((), self.dtype),) if self._timed else ()
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
 
-    def step(self, rotation: ArrayLike, translation: ArrayLike) -> Simulation:
+    def step(
+        self, rotation: ArrayLike, translation: ArrayLike, dt: float | None = None
+    ) -> Simulation:
         """Move the tool.
 
         Args:
             rotation: of the tool, orthogonal with determinant 1; shape (3, 3).
             translation: of its origin, mm; shape (3,).
+            dt: time since the step before, s; a force that relaxes needs it, nothing else reads it.
+                One that is negative or no number gives a row of NaN with BACK_IN_TIME and changes
+                nothing else.
 
         Returns:
             Fields as those of `simulate`, without the axis of rows, finished: numpy arrays; but
@@ -131,7 +149,8 @@ class Session:
             `vertices`) lies on the device.
 
         Raises:
-            ValueError: another shape, or a matrix that is no rotation; the state stays as it was.
+            ValueError: another shape, or a matrix that is no rotation; no dt where the force
+                relaxes; the state stays as it was.
         """
         begin = time.perf_counter()
         turn, place = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
@@ -141,9 +160,14 @@ class Session:
             )
         if not is_rotation(turn):
             check_rotations("rotation", turn[None])
+        pose = turn, place
+        if self._timed:
+            if dt is None:
+                raise ValueError(NO_TIME)
+            pose = turn, place, np.asarray(dt, self.dtype)
         with self._lock:
             # Two arrays: to make one of them takes longer than it saves.
-            result = self._program(turn, place, self._numbers)
+            result = self._program(*pose, self._numbers)
             self._last_force = next_force(self._last_force, result)
             self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
             self._steps += 1
@@ -186,7 +210,7 @@ class Session:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the program, which is compiled anew."""
-        names = "scene", "material", "dtype", "_seconds", "_steps", "_last_force"
+        names = "scene", "material", "dtype", "_stiffness", "_seconds", "_steps", "_last_force"
         with self._lock:
             kept = {name: getattr(self, name) for name in names}
             return kept | {"numbers": np.array(self._program.state)}
@@ -209,7 +233,7 @@ class Session:
         """
         return held_force(self._last_force)
 
-    def set_material(self, material: Material) -> None:
+    def set_material(self, material: AnyMaterial) -> None:
         """Go on with other values of the material; nothing is compiled.
 
         The tool stays on its anchor (`reset` lets it begin anew). A single number may stand where
@@ -222,11 +246,12 @@ class Session:
             ValueError: a value that is missing or was not there before, of another shape or dtype,
                 or that no scene reads.
         """
-        if not isinstance(material, Material):
-            raise ValueError(f"material is {type(material).__name__}; expected a Material")
+        check_word("material", material, AnyMaterial)
+        check_kind(self.scene, material)
         if not _same_kind(material, self.material):
             check_material(self.scene.geometry, material)
-            check_alike(material, self._given.like.material, "make a new Session")
+            _check_branches(material, self.material)
+            check_alike(long_run(material), long_run(self._given.like.material), CURE)
         with self._lock:
             self._change(self.scene, material)
 
@@ -284,7 +309,21 @@ class Session:
         )  # fmt: skip
 
 
-def _same_kind(new: Material, old: AnyMaterial) -> bool:
+def _check_branches(new: AnyMaterial, old: AnyMaterial) -> None:
+    """Refuse another number of branches.
+
+    Raises:
+        ValueError: what was expected.
+    """
+    if type(new) is not type(old):
+        raise ValueError(f"material is {type(new).__name__}; expected {type(old).__name__}: {CURE}")
+    if isinstance(new, RelaxingMaterial) and isinstance(old, RelaxingMaterial):
+        found, expected = (jax.tree.map(jnp.shape, m.relaxation) for m in (new, old))
+        if found != expected:
+            raise ValueError(f"relaxation has shapes {found}; expected {expected}: {CURE}")
+
+
+def _same_kind(new: AnyMaterial, old: AnyMaterial) -> bool:
     """Whether no value of one has another shape or dtype than in the other, which was checked."""
     was = vars(old)
     return all(

@@ -14,12 +14,18 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
+from jaxtrachea.mechanics.press_history import History, Samples, at_rest
+from jaxtrachea.mechanics.press_in_time import validated
+from jaxtrachea.mechanics.samples import in_order
+from jaxtrachea.relaxation.filter import Relaxation
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
 from jaxtrachea.scene.programs import Moved, move
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import (
+    REFUSALS,
     hidden_rows,
     mask_rows,
     refuse,
@@ -56,7 +62,8 @@ class Simulation(NamedTuple):
         end_U: displacement of the rings' ends at -alpha.
         end_V: at +alpha.
         slip: way the tool has slid over the surface (friction).
-        dissipated: work lost to friction in each row, N mm.
+        dissipated: work lost in each row, N mm: to friction, or in `simulate` to what relaxes (None
+            with a skeleton that softens or of deforming cross-sections, where it is not derived).
         frame: columns tangent, anterior, lateral at the contact; shape (rows, 3, 3). None: the tube
             is straight, or the contact points are given.
         vertices: deformed surface in the frame of the mesh; shape (rows, vertices, 3).
@@ -65,6 +72,9 @@ class Simulation(NamedTuple):
         contact_share: penetration against what the contact is sure for (tool's radius and rounding
             of the patches); NaN for sharp ones.
         status: a `PressStatus` per row.
+        time: of the path, s; None: it has none (or a step was told how long it took).
+        stiffness: of the contact in each row, N/mm: derivative of the force by the tool's position,
+            both in the frame of the poses; shape (rows, 3, 3). Of `step` alone, on request.
     """
 
     s: Float[Array, " rows"]
@@ -86,6 +96,8 @@ class Simulation(NamedTuple):
     depth_share: Float[Array, " rows"]
     contact_share: Float[Array, " rows"] | None
     status: Int[Array, " rows"]
+    time: Float[Array, " rows"] | None = None
+    stiffness: Float[Array, "rows 3 3"] | None = None
 
 
 def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
@@ -98,9 +110,16 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     coefficient of friction is NaN with BAD_MATERIAL in every row. What the user or a tolerance left
     out (`Plan.ignored`), and what the material does not give, is left out of any path.
 
+    A force that relaxes (docs/model.md) is at rest before the first row. A row before an earlier
+    one, or at no time, is NaN with BACK_IN_TIME, and all others are as if it were not there; so it
+    is with a pose that is no number. After a row without a solution, or one that was refused, the
+    history is unknown: all later ones are NaN with its status. Where the tool has left, the shape
+    is that of the surface, which recovers by itself.
+
     Args:
         scene: from `make_scene`, or put together by hand.
-        material: as the plan needs it; a `SectionMaterial` for a skeleton `sections`.
+        material: as the plan needs it; a `SectionMaterial` for a skeleton `sections`, and a
+            `RelaxingMaterial` for a force that relaxes.
         path: `Poses` if the plan has contact, else `Presses`.
 
     Raises:
@@ -122,8 +141,36 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
 def _simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
     """`simulate`, of arguments that are checked."""
     made = approach(scene, path) if isinstance(path, Poses) else None
-    result, press = pressed(scene, material, path, made)
-    return result._replace(vertices=surface(scene, path, press))
+    result, press = pressed(scene, material, path, made, before=before_path(scene, material, path))
+    return result._replace(vertices=surface(scene, path, press), time=path.time)
+
+
+class Before(NamedTuple):
+    """What came before the rows of a force that relaxes.
+
+    Attributes:
+        history: what is remembered.
+        time: of every row, s; of a single step None.
+        dt: how long a single step takes, s; of a path None.
+    """
+
+    history: History
+    time: Float[Array, " rows"] | None = None
+    dt: Float[Array, ""] | None = None
+
+
+def before_path(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Before | None:
+    """Rest, of a force that relaxes; else None.
+
+    Raises:
+        ValueError: a path without times.
+    """
+    if not isinstance(material, RelaxingMaterial) or not scene.plan.has("relaxation"):
+        return None
+    if path.time is None:
+        raise ValueError("path.time is None; expected a time for every row: the plan relaxes")
+    vector = scene.plan.second_plane or not scene.plan.mechanics.hangs_on_rings
+    return Before(at_rest(material.relaxation, scene.plan.options, vector), path.time)
 
 
 class Pressed(NamedTuple):
@@ -134,12 +181,14 @@ class Pressed(NamedTuple):
         moved: what they do.
         made: the tool's way; its `pull` is left out.
         hidden: rows that were refused, see `refusals.hidden_rows`.
+        history: what a force that relaxes remembers after the last row; else None.
     """
 
     presses: Presses
     moved: Any
     made: Approach | None
     hidden: Bool[Array, " rows"] | None
+    history: History | None = None
 
 
 @full_precision
@@ -148,7 +197,8 @@ def pressed(
     material: AnyMaterial,
     path: Poses | Presses,
     made: Approach | None,
-    solve: Callable[[Presses], Moved] | None = None,
+    solve: Callable[..., Moved] | None = None,
+    before: Before | None = None,
 ) -> tuple[Simulation, Pressed]:
     """All of `simulate` but the surface, and what that follows from.
 
@@ -158,12 +208,20 @@ def pressed(
         path: as for `simulate`.
         made: the tool's way; None: the path is of presses.
         solve: what presses do, if their place is known already; None: the program of the plan.
+        before: of a force that relaxes; else None.
     """
     plan = scene.plan
-    safe, bad = without_negative_values(scene, material)
+    safe, bad = without_negative_values(scene, long_run(material))
     given = path if isinstance(path, Presses) else None
     presses, used, inward, refused = refuse(scene, safe, given, made, bad)
-    moved = move(scene, safe, used) if solve is None else solve(used)
+    timed = ()
+    if before is not None and isinstance(material, RelaxingMaterial):
+        samples, back = _samples(material.relaxation, before, presses, refused)
+        refused = refused | {PressStatus.BACK_IN_TIME: back}
+        D = jnp.where(back[:, None], jnp.nan, presses.displacement)
+        presses, timed = Presses(presses.s, presses.phi, D), (samples,)
+    moved = move(scene, safe, used, *timed) if solve is None else solve(used, *timed)
+    moved, history = moved._replace(history=None), moved.history
     force, moment, solved = moved.force, None, moved.status
     of_joints = plan.mechanics.hangs_on_rings
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:
@@ -172,7 +230,7 @@ def pressed(
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
     way = None if made is None else made._replace(pull=None)
     hidden = hidden_rows(scene, refused)
-    press = Pressed(used, moved, way, hidden)
+    press = Pressed(used, moved, way, hidden, history)
     moved, moment = mask_rows(hidden, (moved._replace(force=force, status=None), moment))
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     asked, ends = plan.joints, plan.ring_ends
@@ -199,6 +257,26 @@ def pressed(
     ), press
 
 
+def _samples(
+    relaxation: Relaxation, before: Before, presses: Presses, refused
+) -> tuple[Samples, Bool[Array, " rows"]]:
+    """Rows as samples of a force that relaxes, and which of them go back in time."""
+    if before.time is not None:
+        time, order = in_order(before.time, jnp.sum(presses.displacement, axis=1))
+        back = order == PressStatus.BACK_IN_TIME
+        dt = jnp.diff(time, prepend=time[:1]).astype(presses.s.dtype)
+    else:
+        assert before.dt is not None
+        dt, back = before.dt[None], jnp.zeros(1, bool)
+    relaxation, why = validated(relaxation, jnp.asarray(PressStatus.OK, jnp.int8))
+    status = jnp.broadcast_to(why, presses.s.shape)
+    for code in REFUSALS:
+        if code in refused:
+            status = jnp.where(refused[code], code, status).astype(jnp.int8)
+    skipped = back | refused[PressStatus.NON_FINITE]
+    return Samples(before.history, relaxation, dt, status, skipped), back
+
+
 @full_precision
 def surface(
     scene: Scene, path: Poses | Presses, press: Pressed
@@ -206,6 +284,6 @@ def surface(
     """Deformed vertices, NaN in the rows that were refused; None: the plan has no surface."""
     if scene.plan.surface is None:
         return None
-    presses, moved, made, hidden = press
+    presses, moved, made, hidden, _ = press
     lay = deform_sections if scene.plan.surface == "sections" else deform
     return mask_rows(hidden, lay(scene, presses, moved, path, made))

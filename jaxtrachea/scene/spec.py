@@ -26,13 +26,15 @@ from jaxtrachea.mechanics.sections.material import (
     TOOL_RADIUS,
     SectionMaterial,
 )
+from jaxtrachea.relaxation import laws
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.trachea.material import DEEP, VALUES, meaningless
+from jaxtrachea.trachea.material import DEEP, OF_TIME, VALUES, meaningless
 
 Lengths3 = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Sizes3 = Annotated[list[PositiveLength], Field(min_length=3, max_length=3)]
 Angles3 = Annotated[list[Angle], Field(min_length=3, max_length=3)]
+Duration = Annotated[float, quantity("time", positive=True)]
 Direction = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -145,6 +147,49 @@ class SceneWallSection(WallSection):
     """of the tool's flat end; the local contact follows it"""
 
 
+def _relaxation_keys() -> type[Section]:
+    """A key for each number of a law of relaxation."""
+    keys: dict[str, Any] = {}
+    for name, p in OF_TIME.items():
+        number: Any = Annotated[float, quantity(p.dimension, positive=True)]
+        keys[name] = (number | None, None)
+    return create_model("RelaxationKeys", __base__=Section, **keys)
+
+
+class RelaxationSection(_relaxation_keys()):
+    """[relaxation]: how the force relaxes; see `jaxtrachea.relaxation.laws`."""
+
+    branches: Literal["prony-1", "prony-2", "prony-3", "prony-4", "power", "fung"] = "prony-2"
+    """law of the relaxation, as in a fit"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> "RelaxationSection":
+        given = self.numbers
+        needed = laws.names(self.branches, parts=self.apart)
+        if wanting := [name for name in needed if name not in given]:
+            raise ValueError(f"branches {self.branches!r} need {', '.join(wanting)}; give them")
+        if more := sorted(given.keys() - set(needed)):
+            raise ValueError(f"{', '.join(more)}: not for branches {self.branches!r}; remove it")
+        for name, value in given.items():
+            p, fit = OF_TIME[name], OF_TIME[name].fit
+            if fit is not None and not fit.lower <= value <= fit.upper:
+                unit = "" if p.unit == "1" else f" {p.unit}"
+                raise ValueError(
+                    f"{name} is {value:g}{unit}; expected {fit.lower:g} to {fit.upper:g}{unit}"
+                )
+        return self
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Those that are given, by name."""
+        return {name: v for name in OF_TIME if (v := getattr(self, name)) is not None}
+
+    @property
+    def apart(self) -> bool:
+        """Whether the skeleton has branches of its own."""
+        return any(name.endswith(laws.OF_SKELETON) for name in self.numbers)
+
+
 #: Values of [sections] that have no default of their own.
 NEEDED = tuple(
     f.name for f in dataclasses.fields(SectionMaterial) if f.default is dataclasses.MISSING
@@ -195,10 +240,10 @@ class ToolSection(Section):
 
 #: Ways to write a path: the keys that tell it, and all it may have.
 PATHS = {
-    "press": ({"s", "displacement"}, {"phi", "steps"}),
-    "line": ({"start", "end"}, {"steps", "rotation"}),
-    "poses": ({"positions"}, {"rotation"}),
-    "file": ({"file"}, set()),
+    "press": ({"s", "displacement"}, {"phi", "steps", "duration"}),
+    "line": ({"start", "end"}, {"steps", "rotation", "duration"}),
+    "poses": ({"positions"}, {"rotation", "duration"}),
+    "file": ({"file"}, {"duration"}),
 }
 
 
@@ -220,9 +265,13 @@ class PathSection(Section):
     rotation: Angles3 | None = None
     """of the tool, a rotation vector"""
     file: str | None = None
-    """CSV of x, y, z, rx, ry, rz (mm, rad)"""
+    """CSV of x, y, z, rx, ry, rz (mm, rad), and t (s)"""
     steps: int | None = Field(None, ge=1, le=100_000)
     """rows of a press or a line"""
+    duration: Duration | None = None
+    """from its first row to its last, for a force that relaxes; a press then goes on from the
+    displacement of the one before, and its first row is that
+    """
 
     @property
     def kind(self) -> str:
@@ -350,6 +399,8 @@ class SceneSpec(Section):
     """stiffnesses of deforming cross-sections"""
     wall: SceneWallSection | None = None
     """moduli that those follow from"""
+    relaxation: RelaxationSection | None = None
+    """how the force relaxes in time; the path needs times"""
     tool: ToolSection | None = None
     """the tool; presses need none"""
     path: list[PathSection] = Field(min_length=1)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,12 +19,17 @@ from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.sections.wall import Points
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import Mesh
+
+
+def _time(given: Any) -> Array | None:
+    return None if given is None else real("time", given)
 
 
 class Presses(eqx.Module):
@@ -33,11 +39,13 @@ class Presses(eqx.Module):
         s: contact position, mm; shape (rows,).
         phi: contact angle from the anterior midline, rad; shape (rows,).
         displacement: of the tool along x (to the larynx), y (anterior), z, mm; shape (rows, 3).
+        time: of every row, s, never falling; None: the force must not depend on it.
     """
 
     s: Float[Array, " rows"] = eqx.field(converter=partial(real, "s"))
     phi: Float[Array, " rows"] = eqx.field(converter=partial(real, "phi"))
     displacement: Float[Array, "rows 3"] = eqx.field(converter=partial(real, "displacement"))
+    time: Float[Array, " rows"] | None = eqx.field(default=None, converter=_time)
 
 
 class Poses(eqx.Module):
@@ -47,10 +55,12 @@ class Poses(eqx.Module):
         rotation: orthogonal with determinant 1, which `make_scene` and `simulate` check outside of
             `jit`; shape (rows, 3, 3).
         translation: of the tool's origin, mm; shape (rows, 3).
+        time: as of `Presses`.
     """
 
     rotation: Float[Array, "rows 3 3"] = eqx.field(converter=partial(real, "rotation"))
     translation: Float[Array, "rows 3"] = eqx.field(converter=partial(real, "translation"))
+    time: Float[Array, " rows"] | None = eqx.field(default=None, converter=_time)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,7 +93,7 @@ def check_material(geometry: Geometry, material: AnyMaterial) -> None:
     Raises:
         ValueError: naming the value, what was expected and the cure.
     """
-    level_type(material).check(geometry, material)
+    level_type(material).check(geometry, long_run(material))
 
 
 def check_kind(scene: "Scene", material: AnyMaterial) -> None:
@@ -93,11 +103,40 @@ def check_kind(scene: "Scene", material: AnyMaterial) -> None:
         ValueError: what was expected.
     """
     level = scene.plan.mechanics
+    if level.relaxes and not isinstance(material, RelaxingMaterial):
+        raise ValueError(
+            f"material is {type(material).__name__}; expected RelaxingMaterial (the plan has "
+            f"relaxation {scene.plan.options.relaxation!r})"
+        )
+    if isinstance(material, RelaxingMaterial):
+        if level.relaxes:
+            _check_branches(scene, material)
+        elif "relaxation" not in scene.plan.ignored:
+            raise ValueError(
+                "material relaxes, and the plan has relaxation 'off': make the scene with this "
+                "material and a path with times, or with effects relaxation='off'"
+            )
+    material = long_run(material)
     if not isinstance(material, level.material_type):
         expected = level.material_type.__name__
         if level.material_type is not Material:
             expected += f" (the plan has a skeleton {level.name!r})"
         raise ValueError(f"material is {type(material).__name__}; expected {expected}")
+
+
+def _check_branches(scene: "Scene", material: RelaxingMaterial) -> None:
+    """Refuse branches that do not fit the plan.
+
+    Raises:
+        ValueError: those of the skeleton are missing; another dtype than the scene has.
+    """
+    local, skeleton = material.relaxation
+    if scene.plan.options.relaxation == "parts" and skeleton is None:
+        raise ValueError("relaxation.skeleton is None; the plan has relaxation 'parts'")
+    dtype = scene.footprint.dtype
+    for v in jax.tree.leaves((local, skeleton)):
+        if v.dtype != dtype:
+            raise ValueError(f"relaxation is {v.dtype}; expected {dtype}, as the scene has")
 
 
 def check_path(path: Presses | Poses) -> None:
@@ -119,6 +158,8 @@ def check_path(path: Presses | Poses) -> None:
         rotation = shaped("path.rotation", path.rotation, (rows, 3, 3), why=why)
         if not isinstance(rotation, Tracer):
             check_rotations("path.rotation", np.asarray(rotation))
+    if path.time is not None:
+        shaped("path.time", path.time, (rows,), why=" (rows as the path has)")
 
 
 class Scene(eqx.Module):

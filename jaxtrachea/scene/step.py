@@ -16,25 +16,28 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_word, shaped
-from jaxtrachea._numerics import full_precision
+from jaxtrachea._numerics import full_precision, product
 from jaxtrachea._packed import Packing
 from jaxtrachea.contact.pose import check_rotations
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
+from jaxtrachea.mechanics.press_history import History, at_rest
 from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.grip import Slip, pick
 from jaxtrachea.scene.hold import hold
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
+from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.one_row import Row
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.rub import no_slip
-from jaxtrachea.scene.simulation import Pressed, Simulation, pressed
+from jaxtrachea.scene.simulation import Before, Pressed, Simulation, pressed
 from jaxtrachea.scene.stage import Poses, Scene, check_kind, check_material, touch_tube
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.
-STATE_VERSION = 1
+STATE_VERSION = 2
 
 
 class Origin(NamedTuple):
@@ -61,6 +64,7 @@ class State(eqx.Module):
         last: the step before.
         anchor: the place that the tool holds.
         slip: way it has slid on it; None: no friction.
+        memory: of a force that relaxes; else None.
         origin: the scene that the state belongs to (static).
     """
 
@@ -70,6 +74,7 @@ class State(eqx.Module):
     last: Instant
     anchor: Anchor
     slip: Slip | None
+    memory: Memory | None
     origin: Origin = eqx.field(static=True)
 
 
@@ -84,7 +89,7 @@ def init_state(scene: Scene, material: AnyMaterial) -> State:
         ValueError: as `Session`.
     """
     check_scene(scene, material)
-    state = _start(scene)
+    state = _start(scene, _rest(scene, material))
     return dataclasses.replace(state, origin=origin_of(scene))
 
 
@@ -94,12 +99,16 @@ def step(
     state: State,
     rotation: ArrayLike,
     translation: ArrayLike,
+    dt: ArrayLike | None = None,
+    *,
+    stiffness: bool = False,
 ) -> tuple[State, Simulation]:
     """Move the tool: the next state, and what happens at this pose.
 
     It does what `Session.step` does. A pose that is not finite is a row of NaN with NON_FINITE and
-    leaves the state as it was. Scenes of many environments may differ in their arrays (`vmap` over
-    scene, material and state; make the states by `vmap` of `init_state`), not in their plans.
+    leaves the state as it was, and so does a time that runs back, with BACK_IN_TIME. Scenes of many
+    environments may differ in their arrays (`vmap` over scene, material and state; make the states
+    by `vmap` of `init_state`), not in their plans.
 
     Args:
         scene: that the state was made for.
@@ -108,13 +117,19 @@ def step(
         rotation: of the tool, orthogonal with determinant 1 (checked where it is not traced);
             shape (3, 3).
         translation: of its origin, mm; shape (3,).
+        dt: time since the step before, s; a force that relaxes needs it, nothing else reads it.
+        stiffness: whether `Simulation.stiffness` is asked for (static): derivative of the force by
+            the translation, the rest of this step as it is. Of an elastic force without friction
+            it is symmetric, and of one that relaxes that of a motion within dt: with a dt that is
+            short against the branches the instantaneous one.
 
     Returns:
         The next `State`, and a `Simulation` without the axis of rows.
 
     Raises:
         ValueError: the state of another scene or version; a pose of another shape or dtype, or no
-            rotation; a material that does not fit. What is traced is checked by shape and dtype.
+            rotation; a material that does not fit; no dt where the force relaxes. What is traced is
+            checked by shape and dtype.
     """
     check_scene(scene, material)
     check_state(scene, state)
@@ -126,9 +141,26 @@ def step(
             raise ValueError(f"{name} is {v.dtype}; expected {dtype}, as the scene has")
     if not isinstance(rotation, Tracer):
         check_rotations("rotation", np.asarray(rotation)[None])
-    given = scene, material, state, rotation, translation
+    given = scene, material, state, rotation, translation, step_time(scene, dt)
     traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(given))
-    return _step(*given) if traced else _compiled(*given)
+    return (_step if traced else _compiled)(*given, stiffness=stiffness)
+
+
+def step_time(scene: Scene, dt: ArrayLike | None) -> Array | None:
+    """The time of a step in the dtype of the scene; None where nothing reads it.
+
+    Raises:
+        ValueError: none is given, and the force relaxes; or no number.
+    """
+    if not scene.plan.has("relaxation"):
+        return None
+    if dt is None:
+        raise ValueError(NO_TIME)
+    return shaped("dt", dt, (), dtype=scene.footprint.dtype).astype(scene.footprint.dtype)
+
+
+#: Where a step is not told how long it took.
+NO_TIME = "dt is None; expected the time since the step before, s: the force of this plan relaxes"
 
 
 def check_scene(scene: Scene, material: AnyMaterial) -> None:
@@ -198,8 +230,16 @@ def digest_of(scene: Scene) -> str:
     return made.hexdigest()
 
 
+def _rest(scene: Scene, material: AnyMaterial) -> History | None:
+    """The history of nothing; None: the force does not relax."""
+    if not scene.plan.has("relaxation"):
+        return None
+    assert isinstance(material, RelaxingMaterial)
+    return at_rest(material.relaxation, scene.plan.options, scene.plan.second_plane)
+
+
 @jax.jit
-def _start(scene: Scene) -> State:
+def _start(scene: Scene, rest: History | None) -> State:
     """Before the first step."""
     dtype = scene.footprint.dtype
     path = Poses(jnp.eye(3, dtype=dtype)[None], jnp.zeros((1, 3), dtype))
@@ -209,6 +249,7 @@ def _start(scene: Scene) -> State:
     return State(
         started=no, touching=no, side=jnp.asarray(Side.UNTOLD), last=nowhere,
         anchor=anchor_at(scene, nowhere), slip=no_slip(dtype) if scene.plan.friction else None,
+        memory=None if rest is None else Memory(rest, jnp.zeros((), dtype), jnp.zeros((), dtype)),
         origin=origin_of(scene),
     )  # fmt: skip
 
@@ -236,55 +277,82 @@ def changeable(scene: Scene, material: AnyMaterial) -> Changeable:
 class Numbers:
     """A step of numbers: what changes, and the state, are one array each (`_packed`).
 
+    A pose is followed by the time of the step where the force relaxes, and then by what changes.
+
     Attributes:
         given: layout of what may change.
         states: layout of the state.
     """
 
-    def __init__(self, scene: Scene, given: Changeable, state: State):
+    def __init__(self, scene: Scene, given: Changeable, state: State, *, stiffness: bool):
         """Lay out what changes and the state, or others of their shapes."""
-        self._scene = scene
+        self._scene, self._stiffness = scene, stiffness
         self.given, self.states = Packing(given, weak=scene.footprint.dtype), Packing(state)
 
-    def setting(self, rotation, translation, numbers) -> tuple[Scene, AnyMaterial]:
+    def setting(self, *given) -> tuple[Scene, AnyMaterial]:
         """Scene and material (traced)."""
-        new = self.given.unpack(numbers)
+        new = self.given.unpack(given[-1])
         scene = dataclasses.replace(self._scene, tool=new.tool, footprint=new.footprint)
         return scene, new.material
 
-    def step(self, state, rotation, translation, numbers):
+    def step(self, state, *given):
         """As `move_tool` (traced)."""
-        scene, material = self.setting(rotation, translation, numbers)
-        moved = move_tool(scene, material, self.states.unpack(state), rotation, translation)
+        scene, material = self.setting(*given)
+        move = move_with_stiffness if self._stiffness else move_tool
+        moved = move(scene, material, self.states.unpack(state), *given[:-1])
         return self.states.pack(moved[0]), *moved[1:]
 
 
-def _step(scene: Scene, material: AnyMaterial, state: State, rotation, translation):
+def _step(
+    scene: Scene, material: AnyMaterial, state: State, rotation, translation, dt=None, *,
+    stiffness: bool = False,
+):  # fmt: skip
     """`step`, of arguments that are checked: by the program of a `Session`.
 
     To the bit, if the scene is no argument of the compiled function: its arrays are constants there
     as here, and those that may change are none (hence the barrier).
     """
     given = changeable(scene, material)
-    numbers = Numbers(scene, given, state)
+    numbers = Numbers(scene, given, state, stiffness=stiffness)
+    timed = () if dt is None else (dt,)
     row = Row(scene, numbers.setting, numbers.step)
     packed, result = row(
         numbers.states.pack(state),
         rotation,
         translation,
+        *timed,
         jax.lax.optimization_barrier(numbers.given.pack(given)),
     )
     return numbers.states.unpack(packed), result
 
 
-_compiled = jax.jit(_step)
+_compiled = jax.jit(_step, static_argnames="stiffness")
+
+
+def move_with_stiffness(scene: Scene, material: Any, state: State, rotation, translation, *dt):
+    """As `move_tool`, with the derivative of the force by the translation."""
+
+    def forces(translation):
+        moved = move_tool(scene, material, state, rotation, translation, *dt)
+        result = moved[1]
+        force = result.force
+        return force if result.frame is None else product(result.frame, force), moved
+
+    stiffness, (after, result, press) = jax.jacfwd(forces, has_aux=True)(translation)
+    there = jnp.isfinite(jnp.sum(result.force))
+    stiffness = jnp.where(there, stiffness, jnp.nan)
+    return after, result._replace(stiffness=stiffness), press
 
 
 @full_precision
 def move_tool(
-    scene: Scene, material: Any, state: State, rotation, translation
+    scene: Scene, material: Any, state: State, rotation, translation, dt=None
 ) -> tuple[State, Simulation, tuple[Poses, Pressed]]:
     """The next state, the result without its axis of rows, and what the surface follows from."""
+    rest, back = _rest(scene, material), None
+    if dt is not None:
+        back = ~((dt >= 0) & jnp.isfinite(dt))
+        dt, translation = jnp.where(back, 0, dt), jnp.where(back, jnp.nan, translation)
     path = Poses(rotation[None], translation[None])
     each = approach(scene, path) if scene.plan.contact_point == "per_step" else None
     here = Instant(path, touch_tube(scene, path) if each is None else each.seen)
@@ -292,8 +360,15 @@ def move_tool(
     side = next_side(state.side, at)
     inside = (side == Side.IN_LUMEN)[None]
     if each is None:
-        after, path, each, held = hold(scene, material, state, here, inside)
-        result, press = pressed(scene, material, path, each, held.solve)
+        after, path, each, held = hold(scene, long_run(material), state, here, inside, rest)
+        before = None if after.memory is None else Before(after.memory.press, dt=dt)
+        result, press = pressed(scene, material, path, each, held.solve, before)
+        if after.memory is not None:
+            memory = after.memory._replace(press=press.history)
+            after, press = dataclasses.replace(after, memory=memory), press._replace(history=None)
+            # A loop has microseconds: what the dashpots take is a sixth of a step.
+            result = result._replace(dissipated=None)
+            press = press._replace(moved=press.moved._replace(dissipated=None))
         if held.total is not None and result.slip is not None:
             total = jnp.where(jnp.isnan(result.slip), jnp.nan, held.total)
             result = result._replace(slip=total)
@@ -304,4 +379,7 @@ def move_tool(
     result = jax.tree.map(lambda v: v[0], result)
     wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
     result = result._replace(status=jnp.where(at.known, result.status, wrong))
+    if back is not None:
+        wrong = jnp.asarray(PressStatus.BACK_IN_TIME, result.status.dtype)
+        result = result._replace(status=jnp.where(back, wrong, result.status))
     return pick(at.known, after, state), result, (path, press)

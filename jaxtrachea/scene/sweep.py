@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.mechanics.oblique import press_oblique
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.mechanics.ring import on_ring
@@ -97,6 +98,7 @@ def _sweep(
 ) -> Sweep:
     """`sweep`, of arguments that are checked."""
     unlike = set(lacking(scene, material)) - {"axial"}
+    lasting = long_run(material)
     straight_in = scene.plan.has("skeleton") or scene.plan.has("width")
     flat = straight_in and not scene.plan.second_plane
     kind = "width" if scene.plan.has("width") else scene.plan.options.skeleton
@@ -108,7 +110,7 @@ def _sweep(
         behind = on_the_tube(scene, s_c, phi_at)[2] & ~acting
         phi_c, d = (jnp.where(behind, 0, v) for v in (phi_at, d))  # needs nothing of the rings
         inward = local_frame(phi_c)[0]
-        found = pressed(scene, material, s_c, phi_c, d)
+        found = pressed(scene, lasting, s_c, phi_c, d)
         force, way, depth = (v @ inward for v in (found.force, found.skeleton, found.depth))
         free = ~(force != 0)
         softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
@@ -119,7 +121,7 @@ def _sweep(
             if flat and not unlike:
                 off = acting & off_midline(phi_at)
             elif unlike == {"skeleton"}:
-                off = acting & deep(scene, material, d)
+                off = acting & deep(scene, lasting, d)
             refused = {code: refused.get(code, False) | (found.status == code) for code in REFUSALS}
             refused[PressStatus.OFF_PLAN] = off
             force, depth, softness = (jnp.where(off, jnp.nan, v) for v in (force, depth, softness))

@@ -14,7 +14,7 @@ from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.session import Session
-from jaxtrachea.scene.simulation import pressed, simulate
+from jaxtrachea.scene.simulation import before_path, pressed, simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.scene.step import check_scene
 
@@ -27,6 +27,10 @@ FEWEST = 6
 Arguments = tuple[Scene, AnyMaterial, Poses | Presses]
 Call = Callable[[], object]
 Path = TypeVar("Path", bound=Poses | Presses)
+
+
+#: Time of a step of a force that relaxes, s.
+STEP = 1e-3
 
 
 def last_row(path: Path) -> Path:
@@ -71,7 +75,7 @@ def one_pose(arguments: Arguments) -> Call:
     assert isinstance(row, Poses)
     session = Session(scene, material)
     pose = np.asarray(row.rotation[0]), np.asarray(row.translation[0])
-    return lambda: session.step(*pose)
+    return lambda: session.step(*pose, STEP)
 
 
 def _alone(scene: Scene, material: AnyMaterial, row: Poses | Presses) -> Call:
@@ -83,7 +87,8 @@ def _alone(scene: Scene, material: AnyMaterial, row: Poses | Presses) -> Call:
     def step(state, numbers):
         material, path = given.unpack(numbers)
         made = approach(scene, path) if isinstance(path, Poses) else None
-        result, press = pressed(scene, material, path, made)
+        before = before_path(scene, material, path)
+        result, press = pressed(scene, material, path, made, before=before)
         return state, jax.tree.map(lambda v: v[0], result), (path, press)
 
     numbers = jax.device_put(given.fill((material, row)))

@@ -66,6 +66,8 @@ def ladders(full: Full) -> tuple[list[Ladder], dict[str, str]]:
     series = "friction needs coupling 'series'" if plan.friction else ""
     if plan.has("skeleton"):
         series = "a skeleton that softens needs coupling 'series'"
+    if plan.level("relaxation") == "parts":
+        series = "parts that relax apart need coupling 'series'"
     add("coupling", "model", _words("coupling", "total", "series"), series)
     reasons = {effect.name: effect.reason for effect in plan.effects}
     if plan.second_plane:

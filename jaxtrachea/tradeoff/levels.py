@@ -13,6 +13,8 @@ import numpy as np
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.contact.search import FINE
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.press import default_transition
 from jaxtrachea.scene.assemble import with_geometry, with_mesh
 from jaxtrachea.scene.build import Staged, effects_of
@@ -225,25 +227,29 @@ def _mesh(geometry: Geometry, made: tuple[int, int, float, float | None], factor
     return make_tube(geometry, around=many[0], along=many[1], wall=wall, relief=relief)
 
 
-def solve(scene: Scene, material: Material, path: Poses | Presses):
+def solve(scene: Scene, material: AnyMaterial, path: Poses | Presses):
     """`simulate`, and how the force changes with each parameter per relative change of it.
 
     Returns:
         The `Simulation` and d force / d log parameter, N; shape (rows, 3, parameters).
     """
-    names = parameter_names(material)
-    values = {name: getattr(material, name) for name in names}
+    names, lasting = parameter_names(material), long_run(material)
+    values = {name: getattr(lasting, name) for name in names}
 
     def forces(share):
         changed = {name: v * (1 + share[i]) for i, (name, v) in enumerate(values.items())}
-        out = simulate(scene, dataclasses.replace(material, **changed), path)
+        new: Any = dataclasses.replace(lasting, **changed)
+        if isinstance(material, RelaxingMaterial):
+            new = RelaxingMaterial(new, material.relaxation)
+        out = simulate(scene, new, path)
         return out.force, out
 
-    change, out = jax.jacfwd(forces, has_aux=True)(jnp.zeros(len(names), material.k_1.dtype))
+    change, out = jax.jacfwd(forces, has_aux=True)(jnp.zeros(len(names), lasting.k_1.dtype))
     return out, change
 
 
-def parameter_names(material: Material) -> list[str]:
-    """Parameters that the material has."""
+def parameter_names(material: AnyMaterial) -> list[str]:
+    """Parameters that the material has; of one that relaxes in the long run."""
+    material = long_run(material)
     names = [field.name for field in dataclasses.fields(material)]
     return [name for name in names if getattr(material, name) is not None]

@@ -9,6 +9,7 @@ import jax
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._compiler import quick_options
+from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.programs import Moved, one_plane, vectors
@@ -24,7 +25,7 @@ PART: dict[str, Part] = {
     "dent": "surface", "end_motion": "surface",
 }  # fmt: skip
 #: Ladders that change every part: there the whole is all there is.
-WHOLE = ("dtype", "together")
+WHOLE = ("dtype", "together", "relaxation")
 
 
 class Inputs(NamedTuple):
@@ -57,7 +58,7 @@ def inputs(full: Full) -> Inputs:
         made = _quickly(approach)(scene, row)
         bare = dataclasses.replace(scene, plan=scene.plan.at(dent="off", surface="off"))
         out = _quickly(simulate)(bare, material, row)
-        presses = Presses(out.s, out.phi, out.displacement)
+        presses = Presses(out.s, out.phi, out.displacement, row.time)
     assert isinstance(presses, Presses)
     return Inputs(row, made, presses, _quickly(_skeleton)(scene, material, presses))
 
@@ -89,8 +90,9 @@ def part(name: Part, full: Full, levels: Levels, given: Inputs) -> tuple[Callabl
 
 
 def _skeleton(scene, material, presses) -> Moved:
-    """Force and skeleton."""
-    return (vectors if scene.plan.second_plane else one_plane)(scene, material, presses)
+    """Force and skeleton, of a force that relaxes in the long run."""
+    solve = vectors if scene.plan.second_plane else one_plane
+    return solve(scene, long_run(material), presses)
 
 
 def _quickly(function: Callable) -> Callable:

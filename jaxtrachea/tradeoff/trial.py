@@ -114,7 +114,7 @@ def samples(full: Full) -> Poses | Presses:
     if isinstance(path, Presses):
         moved = [
             Presses(jnp.clip(path.s + a * spacing, low, high), path.phi,
-                    path.displacement * (1 + d)) for a, d in BESIDE
+                    path.displacement * (1 + d), path.time) for a, d in BESIDE
         ]  # fmt: skip
     else:
         made = jax.jit(approach)(full.scene, path)
@@ -122,5 +122,5 @@ def samples(full: Full) -> Poses | Presses:
         deep = max(-float(made.seen.gap[row]), 0.0)
         along = jnp.eye(3)[0] if made.frame is None else made.frame[row][:, 0]
         shifts = [a * spacing * along - d * deep * made.seen.normal[row] for a, d in BESIDE]
-        moved = [Poses(path.rotation, path.translation + v) for v in shifts]
+        moved = [Poses(path.rotation, path.translation + v, path.time) for v in shifts]
     return jax.tree.map(lambda *v: jnp.stack(v), *moved)

@@ -12,7 +12,7 @@ from small_scenes import BALL, BARE, MATERIAL, SPRINGS, TUBE, ball, poses
 from jaxtrachea import Poses, make_scene, simulate, sweep
 from jaxtrachea.config import SpecError
 from jaxtrachea.scene.build import effects_of
-from jaxtrachea.scene.declare import SceneFacts
+from jaxtrachea.scene.declare import RELAXES, RELAXES_APART, SceneFacts
 from jaxtrachea.scene.effects import EFFECTS, EffectOptions, goes_with
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
@@ -21,8 +21,8 @@ from jaxtrachea.status import PressStatus
 
 run, swept = jax.jit(simulate), jax.jit(sweep)
 ALL = frozenset({"EA_L", "EI_C", "k_t", "GA_L", "k_A", "k_B", "k_1_ring"})
-#: What has no second plane: a tool with a width, a skeleton that softens.
-FLAT = {"width", "skeleton"}
+#: What has no second plane (a tool with a width, a skeleton that softens), or no friction.
+FLAT = {"width", "skeleton", "relaxation"}
 #: A scene in which every other effect is on.
 EVERYTHING = SceneFacts(
     poses=True, angle=0.3, along=0.5, across=0.5, slip=1.0, spacing=10.0, friction=True, known=ALL
@@ -60,6 +60,14 @@ TAKES = {
     "shear": {"shear"},
     "two_material": {"two_material"},
 }
+
+
+def test_a_plan_without_friction_relaxes():
+    known = ALL - {"EI_C", "k_t"} | {RELAXES, RELAXES_APART}
+    plan = make_plan(SceneFacts(known=known, timed=True, duration=2.0))
+    assert plan.level("relaxation") == "parts"
+    assert plan.at(relaxation="uniform").options.relaxation == "uniform"
+    assert plan.without("relaxation").ignored == {"relaxation"}
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -2,25 +2,60 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
+from jaxtrachea._arguments import check_word, real
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.levels.level import Closed, Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.relaxation import laws as relaxation_laws
 from jaxtrachea.relaxation.filter import Relaxation
+from jaxtrachea.relaxation.steps import Branches
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_TIME
 
 
-class Timed(NamedTuple):
-    """Values of a level within, in the long run, and what relaxes."""
+class RelaxingMaterial(eqx.Module):
+    """A material whose force relaxes.
+
+    Attributes:
+        material: values in the long run.
+        relaxation: the branches beside them.
+    """
 
     material: Any
-    relaxation: Relaxation
+    relaxation: Relaxation = eqx.field(converter=lambda given: _as_arrays(given))
+
+
+def _as_arrays(given: Relaxation) -> Relaxation:
+    """Branches of numbers, lists or arrays.
+
+    Raises:
+        ValueError: what are no branches, or a number of times other than of strengths.
+    """
+    check_word("relaxation", given, Relaxation)
+
+    def arrays(name: str, part: Branches) -> Branches:
+        gamma, tau = (real(f"{name}.{of}", v) for of, v in zip(part._fields, part, strict=True))
+        if gamma.ndim != 1 or gamma.shape != tau.shape or not gamma.shape[0]:
+            raise ValueError(
+                f"{name}: gamma has the shape {gamma.shape}, tau {tau.shape}; expected (B,) both"
+            )
+        return Branches(gamma, tau)
+
+    skeleton = given.skeleton
+    if skeleton is not None:
+        skeleton = arrays("relaxation.skeleton", skeleton)
+    return Relaxation(arrays("relaxation.local", given.local), skeleton)
+
+
+def long_run(material: Any) -> Any:
+    """The values in the long run, of a material that relaxes as of any other."""
+    return material.material if isinstance(material, RelaxingMaterial) else material
 
 
 def _of_inner(name: str) -> Any:
@@ -38,7 +73,6 @@ class Relaxing(Level):
 
     inner: Level
     options: Options
-    stepwise: ClassVar = False
     relaxes: ClassVar = True
     material_type = _of_inner("material_type")
     observes = _of_inner("observes")
@@ -48,6 +82,7 @@ class Relaxing(Level):
     follows_axial = _of_inner("follows_axial")
     hangs_on_rings = _of_inner("hangs_on_rings")
     hides_refused = _of_inner("hides_refused")
+    stepwise = _of_inner("stepwise")
     name = _of_inner("name")
     validated_depth = _of_inner("validated_depth")
     validated_angle = _of_inner("validated_angle")
@@ -103,9 +138,9 @@ class Relaxing(Level):
         """Where parts relax apart, every sample is an equilibrium with a past."""
         return self.options.relaxation == "parts" or self.inner.forward
 
-    def material(self, values: Mapping[str, Array]) -> Timed:
+    def material(self, values: Mapping[str, Array]) -> RelaxingMaterial:
         """Values of the level within, and the branches."""
-        return Timed(self.inner.material(values), self.relaxation(values))
+        return RelaxingMaterial(self.inner.material(values), self.relaxation(values))
 
     def relaxation(self, values: Mapping[str, Array]) -> Relaxation:
         """See `relaxation_laws.relaxation`."""
@@ -113,7 +148,7 @@ class Relaxing(Level):
         parts = o.relaxation == "parts"
         return relaxation_laws.relaxation(o.branches, values, o.span, parts=parts)
 
-    def response(self, tube: Geometry, material: Timed, motion: Motion) -> Response:
+    def response(self, tube: Geometry, material: RelaxingMaterial, motion: Motion) -> Response:
         """Press in time.
 
         Raises:
