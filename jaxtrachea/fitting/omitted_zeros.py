@@ -10,8 +10,8 @@ of the whitened residuals r by the zero, and M c what the Jacobian's columns lea
     z^2 = (c^T M r)^2 / (c^T M c) / s^2
 
 is the fall of the sum of squares, in variances of the noise, that the zero promises. s^2, and the
-independent samples that z^2 counts by (`effective`), are those of the residuals that would be left:
-a model that misses the curve anyway leaves them as correlated as they were.
+independent samples that z^2 counts by (`effective`), are those of the residuals that would be left.
+Where these are still correlated, the model misses the curve and a zero is not what it lacks.
 """
 
 import dataclasses
@@ -21,20 +21,27 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.cost import robust
-from jaxtrachea.fitting.effective import lag_correlation, share_independent
+from jaxtrachea.fitting.effective import CORRELATED, lag_correlation, share_independent
 from jaxtrachea.fitting.lane import force_entries
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.measurements.record_zeros import EVIDENCE, FEW, SHOWN, TOLD_APART
+from jaxtrachea.measurements.record_zeros import FEW, SHOWN, TOLD_APART
 
+#: z^2 from which a zero is asked for: three standard errors, by chance in 0.3 % of the curves. Less
+#: than a record must show (`record_zeros.EVIDENCE`): no shape of the press is looked for here.
+ASKED = 9.0
 #: Zeros that are looked for.
 ZEROS = ("onset", "force_offset")
 #: Differences for derivatives, relative to the size of an unknown or of the press.
 _STEP = 1e-5
 #: Part of a column that others leave below which it is a combination of them.
 _ALIKE = 1e-6
+#: Gauss-Newton steps, the first one included, after which residuals must not be correlated.
+STEPS = 4
+#: Number in `ZEROS` and trial, with the value that is promised, mm or N.
+Chosen = dict[tuple[int, int], float]
 
 class Asked(NamedTuple):
     """Zeros that fits ask for.
@@ -78,14 +85,66 @@ def asked_for(result: FitResult) -> Asked:
     out = Asked({}, {})
     if not len(lanes) or result.study.size == 0:
         return out
-    columns = _columns(result, lanes)
-    for n, lane in enumerate(lanes.tolist()):
-        chosen = _chosen(result, columns, n, able[lane])
-        for (name, trial), value in chosen.items():
+    columns = _columns(result, lanes, result.theta[lanes], result.study)
+    chosen = [_chosen(result, columns, n, able[lane]) for n, lane in enumerate(lanes)]
+    rows = np.flatnonzero([len(v) > 0 for v in chosen])
+    if not len(rows):
+        return out
+    chosen, columns = [chosen[n] for n in rows], _Columns(*(v[rows] for v in columns))
+    for lane, names, fits in zip(
+        columns.lanes, chosen, _fitting(result, columns, chosen), strict=True
+    ):
+        for (z, trial), value in names.items() if fits else ():
             curve = result.study.curves[lane][trial]
-            out.names.setdefault((curve.specimen, curve.trial), set()).add(name)
-            out.value[curve.specimen, curve.trial, name] = value
+            out.names.setdefault((curve.specimen, curve.trial), set()).add(ZEROS[z])
+            out.value[curve.specimen, curve.trial, ZEROS[z]] = value
     return out
+
+
+def _fitting(result: FitResult, columns: _Columns, chosen: list[Chosen]) -> list[bool]:
+    """Whether the residuals that zeros would leave are no longer correlated.
+
+    By the linear model; where it says no, by a few Gauss-Newton steps, since air of a tenth of the
+    press is far from none. A model that misses the curve anyway leaves them correlated.
+    """
+    study, lanes = result.study, columns.lanes
+    theta = result.theta[lanes].copy()
+    shift = np.zeros((len(ZEROS), *study.lanes.s_c.shape))
+    good = np.zeros(len(lanes), bool)
+    for turn in range(STEPS):
+        if turn:
+            later = study.lanes._replace(
+                displacement=study.lanes.displacement - shift[0][..., None],
+                force=study.lanes.force - shift[1][..., None],
+            )
+            columns = _columns(result, lanes, theta, dataclasses.replace(study, lanes=later))
+        for n in np.flatnonzero(~good).tolist():
+            places = list(chosen[n])
+            J, C = _rows(columns, n, places)
+            X = np.concatenate([J, C])
+            size = np.maximum(np.linalg.norm(X, axis=1), 1e-300)
+            r = columns.residual[n].ravel()
+            if not np.isfinite(X).all() or not np.isfinite(r).all():
+                continue
+            step = -np.linalg.lstsq((X / size[:, None]).T, r, rcond=1e-10)[0] / size
+            _, correlation = _unit(result, int(lanes[n]), r + step @ X, len(places))
+            good[n] = correlation <= CORRELATED
+            theta[n] += step[: len(J)]
+            for (z, t), v in zip(places, step[len(J) :], strict=True):
+                shift[z, lanes[n], t] += v
+        theta = np.clip(theta, study.lanes.lower[lanes], study.lanes.upper[lanes])
+        if good.all():
+            break
+    return good.tolist()
+
+
+def _rows(columns: _Columns, n: int, places) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the residual of lane n by the unknowns, and by the zeros of some curves."""
+    J = columns.unknowns[n].reshape(len(columns.unknowns[n]), -1)
+    C = np.zeros((len(places), *columns.residual[n].shape))
+    for k, (z, t) in enumerate(places):
+        C[k, t] = columns.zeros[n, z, t]
+    return J, C.reshape(len(places), J.shape[1])
 
 
 def _able(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
@@ -104,10 +163,16 @@ def _able(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
     return out
 
 
-def _columns(result: FitResult, lanes: Int[np.ndarray, " n"]) -> _Columns:
-    """Residuals and derivatives of some lanes, by differences."""
-    study = result.study
-    theta, relative = result.theta[lanes], result.relative[lanes]
+def _columns(result: FitResult, lanes: Int[np.ndarray, " n"], theta, study: Study) -> _Columns:
+    """Residuals and derivatives of some lanes, by differences.
+
+    Args:
+        result: whose noise and free unknowns.
+        lanes: which.
+        theta: where; (n, P).
+        study: its study, or one with shifted records.
+    """
+    relative = result.relative[lanes]
     free = (study.lanes.active[lanes] > 0) & ~result.at_bound[lanes]
     batch = study.batch_size(result.lanes, 256)  # as `predictions` has it: its program
 
@@ -154,20 +219,16 @@ def _weights(result: FitResult, lanes: Int[np.ndarray, " n"], value) -> np.ndarr
     return weight * np.sqrt(np.asarray(slope))
 
 
-def _chosen(result: FitResult, columns: _Columns, n: int, able) -> dict[tuple[str, int], float]:
-    """Zeros that lane n of `columns` asks for, by name and trial, with their promised values.
+def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
+    """Zeros that lane n of `columns` asks for, with their promised values.
 
     One after the other, the one that promises most first. Where the other zero of the same curve
     promises as much, within `TOLD_APART`, both are taken: nothing tells them apart.
     """
     lane = int(columns.lanes[n])
     r = columns.residual[n].ravel()
-    J = columns.unknowns[n].reshape(len(columns.unknowns[n]), -1)
-    places = [(z, t) for z, t in zip(*np.nonzero(able), strict=True)]
-    C = np.zeros((len(places), r.size))
-    shape = columns.residual[n].shape
-    for k, (z, t) in enumerate(places):
-        C.reshape(-1, *shape)[k, t] = columns.zeros[n, z, t]
+    places = [(int(z), int(t)) for z, t in np.argwhere(able)]
+    J, C = _rows(columns, n, places)
     left = C - (C @ J.T) @ _inverse(result, lane, J) @ J
     gram, slope = C @ left.T, left @ r
     size = np.sum(C * C, axis=1)
@@ -181,8 +242,8 @@ def _chosen(result: FitResult, columns: _Columns, n: int, able) -> dict[tuple[st
         best = int(np.argmax(np.where(possible, fall, -np.inf)))
         now = [*chosen, best]
         step = np.linalg.solve(gram[np.ix_(now, now)], slope[now])
-        unit = _unit(result, lane, r - step @ left[now], len(now))
-        if not fall[best] / unit > EVIDENCE * (1 + FEW / int(result.samples[lane])):
+        unit, _ = _unit(result, lane, r - step @ left[now], len(now))
+        if not fall[best] / unit > ASKED * (1 + FEW / int(result.samples[lane])):
             break
         twins = [
             k for k, (_, t) in enumerate(places)
@@ -193,10 +254,7 @@ def _chosen(result: FitResult, columns: _Columns, n: int, able) -> dict[tuple[st
     if not chosen:
         return {}
     value = -np.linalg.lstsq(gram[np.ix_(chosen, chosen)], slope[chosen], rcond=1e-10)[0]
-    return {
-        (ZEROS[places[k][0]], int(places[k][1])): float(v)
-        for k, v in zip(chosen, value, strict=True)
-    }
+    return {places[k]: float(v) for k, v in zip(chosen, value, strict=True)}
 
 
 def _inverse(result: FitResult, lane: int, J: Float[np.ndarray, "P m"]) -> np.ndarray:
@@ -234,8 +292,11 @@ def _possible(result: FitResult, lane: int, places, value) -> Bool[np.ndarray, "
     return out
 
 
-def _unit(result: FitResult, lane: int, r: Float[np.ndarray, " m"], taken: int) -> float:
-    """Fall of the sum of squares that counts as one variance of independent noise."""
+def _unit(result: FitResult, lane: int, r: Float[np.ndarray, " m"], taken: int):
+    """Fall of the sum of squares that counts as one variance of independent noise.
+
+    And the correlation of neighbours, 0 with too few.
+    """
     study = result.study
     precision = study.lanes.precision[lane]
     left = int(result.samples[lane]) - int(np.sum(study.lanes.active[lane] > 0)) - taken
@@ -244,9 +305,10 @@ def _unit(result: FitResult, lane: int, r: Float[np.ndarray, " m"], taken: int) 
         variance = max(variance, 1.0)
     force = r.reshape(len(precision), -1)[:, : precision.shape[1]]
     force = np.where(precision > 0, force, np.nan)[None]
-    pairs = np.sum(np.isfinite(force[..., 1:]) & np.isfinite(force[..., :-1]))
-    share = share_independent(lag_correlation(force), np.array([max(int(pairs), 1)]))
-    return variance / float(np.nan_to_num(share[0], nan=1.0))
+    pairs = np.sum(np.isfinite(force[..., 1:]) & np.isfinite(force[..., :-1]), axis=(1, 2))
+    correlation = np.nan_to_num(lag_correlation(force))
+    share = share_independent(correlation, np.maximum(pairs, 1))
+    return variance / float(share[0]), float(correlation[0])
 
 
 def near_estimates(result: FitResult, again: Study, asked: Asked) -> Float[np.ndarray, "lanes P"]:
