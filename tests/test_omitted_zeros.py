@@ -2,10 +2,11 @@
 
 import csv
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
+from run_cli import run
+from scipy.signal import lfilter
 
 from jaxtrachea.fitting import omitted_zeros
 from jaxtrachea.fitting.fit import fit, with_omitted_zeros
@@ -15,6 +16,7 @@ from jaxtrachea.fitting.study import build_study
 from jaxtrachea.fitting.zero_messages import sentences_of_fits
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.results.read import read_results
 from jaxtrachea.trachea.geometry import table_1
 
 TOTAL, WAY, SAMPLES = Options(coupling="total"), 4.0, 60
@@ -137,3 +139,37 @@ def test_a_model_that_misses_the_curve_asks_for_nothing():
     result = fit(build_study(curves, table_1(), TOTAL, K_5), Settings(starts=2))
     assert result.study.recipe is not None
     assert not any(result.study.recipe.asked.values())
+
+
+@pytest.mark.slow
+def test_the_command_says_what_a_relaxing_record_hides(tmp_path, monkeypatch, capsys):
+    """0.3 mm of air before a ramp and hold: k_1 was 0.074 +- 0.0024, "identifiable"."""
+    step, speed, taus, shares = 0.0025, 0.5, (1.0, 20.0), (1.0, 1.5)
+    time = np.arange(0, 4.3 / speed + 60, step)
+    D = np.minimum(time * speed, 4.3)
+    u = np.maximum(D - 0.3, 0)
+    elastic = TRUTH["k_1"] * u + TRUTH["k_3"] * u**3 + TRUTH["k_5"] * u**5
+    F = elastic.copy()
+    for share, tau in zip(shares, taus, strict=True):  # exact for a straight piece
+        fade = np.exp(-step / tau)
+        gain = share * tau / step * (1 - fade)
+        F += lfilter([gain], [1, -fade], np.diff(elastic, prepend=0.0))
+    F = F[::20] + 0.002 * F.max() * np.random.default_rng(11).normal(size=len(F[::20]))
+    rows = zip(time[::20], D[::20], F, strict=True)
+    text = "".join(f"{t:.4f},{d:.5f},{f:.6f}\n" for t, d, f in rows)
+    (tmp_path / "r07.csv").write_text("Time [s],Displacement [mm],Force [N]\n" + text)
+    (tmp_path / "fit.toml").write_text(
+        "[data]\nfiles = 'r07.csv'\nloading = 'record'\nsamples = 400\n"
+        "[model]\ncoupling = 'total'\nrelaxation = 'uniform'\nbranches = 'prony-2'\n"
+        "[parameters]\nk_5 = { initial = 0.001 }\n"
+    )
+    out = tmp_path / "out"
+    code, _, err = run(monkeypatch, capsys, "fit", tmp_path / "fit.toml", "--out", out)
+    assert code == 0
+    assert "from its fit" in " ".join(err.split())
+    assert "from its fit" in (out / "report.md").read_text()
+    with (out / "parameters.csv").open(newline="") as stream:
+        found = {row["parameter"]: row for row in csv.DictReader(stream)}
+    for name, truth in {"onset": 0.3, **TRUTH}.items():
+        assert abs(float(found[name]["value"]) - truth) < 3.5 * float(found[name]["se"])
+    assert read_results(out).study.unknowns[0][-1][0].name in ("onset", "force_offset")

@@ -51,9 +51,9 @@ def fit(
     Failed lanes are rows with a status. Where the structure leaves a combination of unknowns open
     (`structure`), one of them is held, so that there is no valley to follow; where an estimate
     gives cause for doubt, other minima are looked for and unknowns are profiled (`verify`). A
-    lane that gives no cause costs nothing more. Where the estimates ask for an `auto` onset or force
-    offset that the record of a curve does not show (`omitted_zeros`), its lane is fitted again with
-    it, and the study of the result has it. Where the noise of forces has a share of the force
+    lane that gives no cause costs nothing more. Where the residuals ask for an `auto` onset or
+    offset that the record of a curve does not show (`omitted_zeros`), its lane is fitted again
+    with it, and the study of the result has it. Where the noise of forces has a share of the force
     to be found (`Noise.force_share`), the fit is made in turns with it; the study of the result
     keeps what was found, and refits from it do, too.
 

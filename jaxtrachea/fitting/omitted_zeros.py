@@ -43,6 +43,7 @@ STEPS = 4
 #: Number in `ZEROS` and trial, with the value that is promised, mm or N.
 Chosen = dict[tuple[int, int], float]
 
+
 class Asked(NamedTuple):
     """Zeros that fits ask for.
 

@@ -188,6 +188,8 @@ def starts_of(
         for t, curve in enumerate(group):
             key = curve.specimen, curve.trial
             for i, name in enumerate(OF_THE_PRESS):
-                if name in resolved.recorded[key] or (name == "force_slope" and name in free - auto):
+                if name in resolved.recorded[key] or (
+                    name == "force_slope" and name in free - auto
+                ):
                     out[lane, t, i] = shown[i][row[key]]
     return None if np.isnan(out).all() else out

@@ -1,6 +1,5 @@
 """Trials that are left out together: mirror images and other twins, which tell of each other."""
 
-import dataclasses
 from collections.abc import Iterable, Sequence
 
 from jaxtrachea._errors import InputError
