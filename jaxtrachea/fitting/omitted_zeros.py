@@ -213,7 +213,7 @@ def _weights(result: FitResult, lanes: Int[np.ndarray, " n"], value) -> np.ndarr
     study = result.study
     of_force = np.arange(value.shape[2]) < force_entries(study.lanes)
     scale = 1 / np.where(of_force, *np.split(result.whitened_sigma[lanes], 2, axis=1))
-    weight = study.lanes.balance[lanes][..., None] * scale[:, None]
+    weight = np.asarray(study.lanes.balance)[lanes][..., None] * scale[:, None]
     if study.model.loss == "linear":
         return weight
     _, slope = robust(study.model.loss, (value * scale[:, None]) ** 2, study.model.loss_scale)
