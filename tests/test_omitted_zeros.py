@@ -142,6 +142,21 @@ def test_a_model_that_misses_the_curve_asks_for_nothing():
 
 
 @pytest.mark.slow
+def test_air_of_one_curve_in_four_is_found_where_the_model_seemed_to_miss():
+    """Coefficients that all curves share leave correlated residuals; with the onset none."""
+    rng = np.random.default_rng(3)
+    curves = [soft(rng, "T", air) for air in (0.25, 0.0, 0.0, 0.0)]
+    curves = [dataclasses.replace(c, trial=str(t)) for t, c in enumerate(curves)]
+    study = build_study(curves, table_1(), TOTAL, K_5)
+    assert study.record_zeros is None
+    result = fit(study, Settings(starts=2))
+    assert result.study.recipe is not None
+    assert result.study.recipe.asked == {("T", "0"): {"onset"}}
+    assert contains(result, 0, "k_1") == (True, "identifiable")
+    np.testing.assert_allclose(result.value[0, -1], 0.25, atol=0.005)
+
+
+@pytest.mark.slow
 def test_the_command_says_what_a_relaxing_record_hides(tmp_path, monkeypatch, capsys):
     """0.3 mm of air before a ramp and hold: k_1 was 0.074 +- 0.0024, "identifiable"."""
     step, speed, taus, shares = 0.0025, 0.5, (1.0, 20.0), (1.0, 1.5)

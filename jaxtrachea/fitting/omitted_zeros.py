@@ -160,7 +160,7 @@ def _able(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
             if p.name == name and p.auto:
                 out[:, z] = there & (study.lanes.index[:, :, j] < 0)
     if out.any():
-        out &= (result.succeeded & ~result.effective.misses)[:, None, None]
+        out &= result.succeeded[:, None, None]
     return out
 
 
