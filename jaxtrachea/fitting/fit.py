@@ -83,8 +83,8 @@ def with_omitted_zeros(
 ) -> FitResult:
     """The fit with the onsets and force offsets that its residuals ask for.
 
-    Their lanes are fitted again, all lanes of a joint study and of one whose noise has a share of
-    the force. A study that was changed since it was built stays as it is.
+    Their lanes are fitted again, or all where the noise has a share of the force. A study that was
+    changed since it was built stays as it is.
 
     Args:
         study: as `build_study` made it.
@@ -98,7 +98,7 @@ def with_omitted_zeros(
             break
         study = with_zeros(study, asked.names)
         near = near_estimates(result, study, asked)
-        if study.joint or study.force_share is not None:
+        if study.force_share is not None:
             result = _without_more_zeros(study, settings, alive, None, near)
             continue
         rows = np.flatnonzero([any(_key(c) in asked.names for c in lane) for lane in study.curves])

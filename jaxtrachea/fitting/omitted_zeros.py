@@ -76,7 +76,8 @@ def asked_for(result: FitResult) -> Asked:
     """Zeros of the curves of a fit that are fixed, `auto`, and not to be fixed by its residuals.
 
     Costs nothing where no zero is `auto`: bonded contact, or zeros that the user names. Else the
-    model is evaluated once for each unknown, and twice, by the program of its residuals.
+    model is evaluated once for each unknown, and twice, by the program of its residuals. A joint
+    fit asks for none: what one lane lacks its shared unknowns spread over the residuals of all.
 
     Args:
         result: the fit.
@@ -152,7 +153,7 @@ def _able(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
     """Zeros that curves have not taken and might, of lanes that have an estimate to be wrong."""
     study = result.study
     out = np.zeros((result.lanes, len(ZEROS), study.lanes.s_c.shape[1]), bool)
-    if study.model.options.contact != "unilateral":
+    if study.joint or study.model.options.contact != "unilateral":
         return out
     there = (study.lanes.precision > 0).any(axis=2)
     for z, name in enumerate(ZEROS):
@@ -230,7 +231,7 @@ def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
     r = columns.residual[n].ravel()
     places = [(int(z), int(t)) for z, t in np.argwhere(able)]
     J, C = _rows(columns, n, places)
-    left = C - (C @ J.T) @ _inverse(result, lane, J) @ J
+    left = C - (C @ J.T) @ np.linalg.pinv(J @ J.T, rcond=1e-14, hermitian=True) @ J
     gram, slope = C @ left.T, left @ r
     size = np.sum(C * C, axis=1)
     usable = np.diag(gram) > _ALIKE * size
@@ -256,16 +257,6 @@ def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
         return {}
     value = -np.linalg.lstsq(gram[np.ix_(chosen, chosen)], slope[chosen], rcond=1e-10)[0]
     return {places[k]: float(v) for k, v in zip(chosen, value, strict=True)}
-
-
-def _inverse(result: FitResult, lane: int, J: Float[np.ndarray, "P m"]) -> np.ndarray:
-    """Inverse of the information on the unknowns of a lane; (P, P).
-
-    Of a joint fit the covariance, in which those of all other lanes are eliminated.
-    """
-    if result.study.joint:
-        return np.nan_to_num(result.uncertainty.covariance[lane])
-    return np.linalg.pinv(J @ J.T, rcond=1e-14, hermitian=True)
 
 
 def _promise(gram, slope, chosen: list[int]):
