@@ -107,7 +107,7 @@ WITHIN = {
         {"result"},
         {"minima", "other_starts", "profile_search"},
         {"needs_review", "evaluate", "force_share"},
-        {"verify"},
+        {"verify", "omitted_zeros"},
         {"fit"},
     ],
     "optimisation": [{"batching", "curvature", "programs", "schur"}, {"trust_region"},

@@ -66,6 +66,15 @@ def _with_zeros(measurements, study, printed: set[str]):
     return dataclasses.replace(measurements, notes=(*measurements.notes, *said))
 
 
+def with_zeros_of_fits(measurements, result):
+    """The measurements with notes on what curves take because their fits ask for it."""
+    from jaxtrachea.fitting.zero_messages import sentences_of_fits
+
+    found = sentences_of_fits(result.study, result.value)
+    _print("note", found, None)
+    return dataclasses.replace(measurements, notes=(*measurements.notes, *found))
+
+
 def _with_depths(measurements, study, printed: set[str]):
     """The measurements with notes on curves beyond what the model was tested for, or made for.
 

@@ -29,7 +29,7 @@ from jaxtrachea.cli import scene as cli_scene
 from jaxtrachea.cli import selfcheck as cli_selfcheck
 from jaxtrachea.cli import tradeoff as cli_tradeoff
 from jaxtrachea.cli.file_options import CheckOptions
-from jaxtrachea.cli.load import load
+from jaxtrachea.cli.load import load, with_zeros_of_fits
 from jaxtrachea.cli.options import DataOption, FitOptions, OutOption, SpecArgument, with_fields
 from jaxtrachea.cli.run import poor, refuse, run, show, write, write_tables
 from jaxtrachea.cli.sources import specification_in
@@ -158,6 +158,7 @@ def fit(options: FitOptions) -> None:
         changed = {"settings": under.settings, "options": under.options}
         findings = run(dataclasses.replace(request, **changed), under.stop_if_asked, under.fit)
         clock.append(time.perf_counter())
+        measurements = with_zeros_of_fits(measurements, findings.result)
         for name, reason in findings.unavailable.items():
             to_stderr(f"[yellow]no {name}:[/] {escape(reason)}")
         write(under.folder, spec, loaded, measurements, findings, clock, under.manifest)

@@ -27,13 +27,19 @@ def refuse(path: Path, request) -> None:
 def run(request, stop_if_asked, fit=None):
     """Fit, by `fit` if given, then what needs a fit; the `AnalysisResults`."""
     from jaxtrachea.fitting.fit import fit as in_one_go
+    from jaxtrachea.fitting.fit import with_omitted_zeros
     from jaxtrachea.inference.analyses import analyse
 
     with progress_bar() as bar:
         stages = Stages(bar, stop_if_asked)
         progress = stages.begin("fitting")
         load_beside("jaxtrachea.report.plots")
-        result = (fit or in_one_go)(request.study, request.settings, progress)
+        asked = request.study, request.settings
+        if fit is None:
+            result = in_one_go(*asked, progress)
+        else:  # shards are of some lanes each: the whole study takes more zeros
+            result = fit(*asked, progress)
+            result = with_omitted_zeros(asked[0], result, asked[1], progress)
         findings = analyse(request, result, stages.begin)
         stages.close()
         return findings

@@ -19,13 +19,15 @@ from jaxtrachea.fitting.minima import (
 )
 from jaxtrachea.fitting.needs_review import needs_review, still_needs_review
 from jaxtrachea.fitting.noise import next_sigma, normal_psi2, precision_unit
+from jaxtrachea.fitting.omitted_zeros import asked_for, merged, near_estimates
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.fitting.starts import scales
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
-from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.study import Study, with_zeros
 from jaxtrachea.fitting.verify import verify_minimum
+from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
@@ -33,6 +35,8 @@ from jaxtrachea.status import FitStatus
 PROVEN = 1e5
 #: Times that a better minimum found by the scrutiny takes the place of the estimate.
 REPLACED = 3
+#: Times that a fit is made again with zeros that it asks for.
+MORE_ZEROS = 3
 
 
 def fit(
@@ -47,7 +51,9 @@ def fit(
     Failed lanes are rows with a status. Where the structure leaves a combination of unknowns open
     (`structure`), one of them is held, so that there is no valley to follow; where an estimate
     gives cause for doubt, other minima are looked for and unknowns are profiled (`verify`). A
-    lane that gives no cause costs nothing more. Where the noise of forces has a share of the force
+    lane that gives no cause costs nothing more. Where the residuals ask for an `auto` onset or
+    offset that the record of a curve does not show (`omitted_zeros`), its lane is fitted again
+    with it, and the study of the result has it. Where the noise of forces has a share of the force
     to be found (`Noise.force_share`), the fit is made in turns with it; the study of the result
     keeps what was found, and refits from it do, too.
 
@@ -65,6 +71,48 @@ def fit(
     check_precision(settings)
     if study.size == 0:
         return evaluated(study)
+    result = _without_more_zeros(study, settings, progress, starts, beside)
+    return with_omitted_zeros(study, result, settings, progress)
+
+
+def with_omitted_zeros(
+    study: Study,
+    result: FitResult,
+    settings: Settings,
+    progress: Callable[[int, int], None] | None = None,
+) -> FitResult:
+    """The fit with the onsets and force offsets that its residuals ask for.
+
+    Their lanes are fitted again, or all where the noise has a share of the force. A study that was
+    changed since it was built stays as it is.
+
+    Args:
+        study: as `build_study` made it.
+        result: its fit.
+        settings: how to solve.
+        progress: as for `fit`.
+    """
+    alive = None if progress is None else lambda done, of: progress(0, of)
+    for _ in range(MORE_ZEROS):
+        if study.recipe is None or not (asked := asked_for(result)).names:
+            break
+        study = with_zeros(study, asked.names)
+        near = near_estimates(result, study, asked)
+        if study.force_share is not None:
+            result = _without_more_zeros(study, settings, alive, None, near)
+            continue
+        rows = np.flatnonzero([any(_key(c) in asked.names for c in lane) for lane in study.curves])
+        new = _without_more_zeros(study.take(rows), settings, alive, None, near[rows])
+        result = merged(study, result, rows, new)
+    return result
+
+
+def _key(curve: Curve) -> tuple[str, str]:
+    return curve.specimen, curve.trial
+
+
+def _without_more_zeros(study: Study, settings: Settings, progress, starts, beside) -> FitResult:
+    """As `fit`, of the study as it is."""
     found = _lowest(study, settings, progress, starts, beside)
     if study.force_share is not None and study.shares is None:
         found = _with_force_share(found, settings, progress)

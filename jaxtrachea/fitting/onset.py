@@ -19,18 +19,29 @@ from jaxtrachea.mechanics.press import Options
 
 
 def natural_steps(
-    parameters: Sequence[Parameter], curves: Sequence[Curve], taken: Taken | None = None
+    parameters: Sequence[Parameter],
+    curves: Sequence[Curve],
+    recorded: Taken | None = None,
+    taken: Taken | None = None,
 ) -> tuple[Parameter, ...]:
     """The table with the steps of a free onset, offset and slope as large as the presses.
 
     A power of ten, not above the median over the curves that have one: studies alike share compiled
-    programs.
+    programs. Where records show one, over these alone: what fits take beyond does not change it.
+
+    Args:
+        parameters: the table.
+        curves: of the study.
+        recorded: what each curve takes by its own record; None: all.
+        taken: what it takes at all, where no record shows one.
     """
 
     def scaled(p: Parameter) -> Parameter:
         if p.fixed or p.name not in OF_THE_PRESS or p.step != DEFAULTS[p.name].step:
             return p
-        own = [c for c in curves if takes(p, c, taken)]
+        own = [c for c in curves if takes(p, c, recorded)] or [
+            c for c in curves if takes(p, c, taken)
+        ]
         span, peak = (
             np.median([np.ptp(c.displacement) for c in own]),
             np.median([np.max(np.abs(c.force)) for c in own]),

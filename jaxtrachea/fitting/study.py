@@ -24,6 +24,7 @@ from jaxtrachea.fitting.lane import size as entries_of_trial
 from jaxtrachea.fitting.lanes import (
     Balance,
     Noise,
+    Taken,
     Unknown,
     Weighting,
     curve_weights,
@@ -79,6 +80,31 @@ class Shares(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Recipe:
+    """Arguments of `build_study` apart from the curves.
+
+    Attributes:
+        geometry: the tube.
+        options: of the model.
+        parameters: the whole table, `auto` rows undecided.
+        noise: see `build_study`.
+        weighting: likewise.
+        tool_radius: likewise.
+        joint: likewise.
+        asked: onsets and offsets that curves take on top of what their records show.
+    """
+
+    geometry: Geometry
+    options: Options
+    parameters: Sequence[Parameter]
+    noise: Noise
+    weighting: Weighting
+    tool_radius: float | None
+    joint: bool
+    asked: Taken
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Study:
     """Measurements divided into lanes, ready to be fitted with a model; from `build_study`.
 
@@ -101,6 +127,7 @@ class Study:
             these show them, mm, N, N/mm; NaN where they take none; None: no curve takes any.
         force_share: of the noise of forces, see `Noise`; None: it has none.
         shares: what the weights of the lanes have of it; None: nothing yet.
+        recipe: how it was built; None of a study that was changed since, or read from a file.
     """
 
     model: FitModel
@@ -117,6 +144,8 @@ class Study:
     record_zeros: Float[np.ndarray, "lanes T 3"] | None = None
     force_share: float | Literal["estimate"] | None = None
     shares: Shares | None = None
+    # Not an argument, so that `dataclasses.replace` drops it: a changed study has none.
+    recipe: Recipe | None = dataclasses.field(default=None, init=False)
 
     def __post_init__(self):
         """Refuse a model of another parameter table.
@@ -331,19 +360,51 @@ def build_study(
         raise ValueError("pressed_ends=False needs tool_radius: which rings are under the tool")
     curves, table = _admitted(curves, geometry, options, parameters)
     check_noise(curves, noise.force)
-    own = resolved(table, curves, options, noise.force)
-    parameters = natural_steps(own.parameters, curves, own.taken)
+    recipe = Recipe(geometry, options, table, noise, weighting, tool_radius, joint, {})
+    return _built(curves, recipe)
+
+
+def with_zeros(study: Study, asked: Taken) -> Study:
+    """A study built again, in which curves take further zeros.
+
+    Args:
+        study: one with a recipe.
+        asked: names of `auto` parameters that curves take on top of those which their records show
+            and which the study has already.
+    """
+    recipe = study.recipe
+    assert recipe is not None
+    every = {k: {*recipe.asked.get(k, ()), *asked.get(k, ())} for k in {*recipe.asked, *asked}}
+    curves = [c for lane in study.curves for c in lane]
+    again = _built(curves, dataclasses.replace(recipe, asked=every))
+    return with_recipe(again, study.holdout_groups)
+
+
+def with_recipe(study: Study, holdout_groups: tuple[tuple[str, ...], ...]) -> Study:
+    """The study with groups of trials that are left out together, its recipe kept."""
+    out = dataclasses.replace(study, holdout_groups=holdout_groups)
+    object.__setattr__(out, "recipe", study.recipe)
+    return out
+
+
+def _built(curves: Sequence[Curve], recipe: Recipe) -> Study:
+    """The study of curves that the model can press."""
+    geometry, options, noise, weighting = (
+        recipe.geometry, recipe.options, recipe.noise, recipe.weighting,
+    )  # fmt: skip
+    own = resolved(recipe.parameters, curves, options, noise.force, recipe.asked)
+    parameters = natural_steps(own.parameters, curves, own.recorded, own.taken)
     if level_of(options).relaxes:
         span = span_of(curves)
         parameters = by_records(parameters, options, span)
         options = with_span(options, span)
-    joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
+    joint = recipe.joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
     unknowns = [unknowns_of(lane, parameters, own.taken) for lane in groups]
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
-        noise=noise, weighting=weighting, tool_radius=tool_radius,
+        noise=noise, weighting=weighting, tool_radius=recipe.tool_radius,
         level=level_of(options),
     )  # fmt: skip
     if weighting.balance == "curve":
@@ -359,7 +420,7 @@ def build_study(
         loss=weighting.loss, loss_scale=float(weighting.loss_scale),
         common=_common(unknowns, parameters, own),
     )  # fmt: skip
-    return Study(
+    study = Study(
         model=model,
         parameters=tuple(parameters),
         lanes=lanes,
@@ -373,6 +434,8 @@ def build_study(
         record_zeros=found,
         force_share=_force_share(noise, known, lanes, parameters, change_points, model),
     )
+    object.__setattr__(study, "recipe", recipe)
+    return study
 
 
 def _force_share(

@@ -1,9 +1,10 @@
-"""Sentences on what curves take from their own records: onset, force offset and line."""
+"""Sentences on what curves take, from their own records or fits: onset, force offset and line."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.study import Study
@@ -82,19 +83,60 @@ def sentences(study: Study) -> list[str]:
     return [*out, *_under_load([s for s in every if s.loaded], count), *_held(study)]
 
 
+def asked_by_fits(study: Study, value: Float[np.ndarray, "lanes P"]) -> list[FittedZeros]:
+    """Curves that take an onset or a force offset which their fits ask for, with the estimates.
+
+    Args:
+        study: of the fit.
+        value: estimates, in the parameters' units.
+    """
+    shown = study.record_zeros
+    column = {p.name: j for j, p in enumerate(study.parameters) if p.auto and not p.fixed}
+    out = []
+    for lane, curves in enumerate(study.curves):
+        for t, curve in enumerate(curves):
+            found = dict.fromkeys(OF_THE_PRESS, np.nan)
+            for name in {"onset", "force_offset"} & column.keys():
+                i = int(study.lanes.index[lane, t, column[name]])
+                recorded = shown is not None and not np.isnan(
+                    shown[lane, t, OF_THE_PRESS.index(name)]
+                )
+                if i >= 0 and not recorded:
+                    found[name] = float(value[lane, i])
+            if not np.isnan(list(found.values())).all():
+                out.append(FittedZeros(curve, **found))
+    return out
+
+
+def sentences_of_fits(study: Study, value: Float[np.ndarray, "lanes P"]) -> list[str]:
+    """What curves take because their fits ask for it; arguments as for `asked_by_fits`."""
+    every, count = asked_by_fits(study, value), sum(map(len, study.curves))
+    why = " (its record alone shows none, its residuals ask for one)"
+    out = []
+    for name, unit in (("onset", "mm"), ("force_offset", "N")):
+        some = [s for s in every if not np.isnan(getattr(s, name))]
+        out += _listed(
+            some, count, name, lambda s, name=name, unit=unit: f"{getattr(s, name):.3g} {unit}",
+            lambda s: f", from its fit{why}", "fits",
+        )  # fmt: skip
+    return out
+
+
 def _share(s: FittedZeros) -> float:
     D = s.curve.displacement
     return 100 * max(s.onset - float(D.min()), 0.0) / float(np.ptp(D))
 
 
-def _listed(some: Sequence[FittedZeros], count: int, what: str, value, more) -> list[str]:
+def _listed(
+    some: Sequence[FittedZeros], count: int, what: str, value, more, source: str = "records"
+) -> list[str]:
     """One sentence a curve of few, one for all of many."""
     if len(some) <= _NAMES:
         return [f"{what} of {s.name}: {value(s)}{more(s)}" for s in some]
     first = ", ".join(f"{s.name} {value(s)}" for s in some[:_NAMES])
     rest = len(some) - _NAMES
     return [
-        f"{what} of {len(some)} of {count} curves, from their records: {first} and {rest} more "
+        f"{what} of {len(some)} of {count} curves, from their {source}: {first} and {rest} more "
         "(curves.csv)"
     ]
 

@@ -28,11 +28,13 @@ class Resolved:
         parameters: the table; free where at least one curve takes it.
         taken: of the free ones that are `auto`, by specimen and trial.
         zeros: what the records show, in the order of the curves; None: nobody looked.
+        recorded: what of `taken` the records show; the rest was asked for.
     """
 
     parameters: tuple[Parameter, ...]
     taken: Taken
     zeros: Zeros | None
+    recorded: Taken
 
 
 def resolved(
@@ -40,6 +42,7 @@ def resolved(
     curves: Sequence[Curve],
     options: Options,
     sigma: float | None = None,
+    asked: Taken | None = None,
 ) -> Resolved:
     """The table with its `auto` rows decided.
 
@@ -48,6 +51,7 @@ def resolved(
         curves: of the study.
         options: of the model.
         sigma: given standard deviation of a force sample, N; a curve's own comes before it.
+        asked: what curves take on top of what their records show (`omitted_zeros`).
 
     Raises:
         InputError: a line is asked for and a curve has too few samples before first touch.
@@ -58,7 +62,7 @@ def resolved(
     wanted = any(p.name == "force_slope" and not p.fixed for p in table)
     looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
     if not (wanted or looked):
-        return Resolved(_without_flat_line(table), {}, None)
+        return Resolved(_without_flat_line(table), {}, None, {})
     zeros = zeros_of(curves, sigma, table)
     if wanted:
         for curve, reason in zip(curves, without_line(curves, zeros), strict=True):
@@ -73,15 +77,19 @@ def resolved(
         zeros = zeros._replace(offset=np.where(begins, zeros.first, zeros.offset))
     shown["force_slope"] = _sloping(curves, zeros)
     shown["force_offset"] = shown["force_offset"] | (wanted | shown["force_slope"])
-    taken: dict[tuple[str, str], set[str]] = {(c.specimen, c.trial): set() for c in curves}
+    recorded: dict[tuple[str, str], set[str]] = {(c.specimen, c.trial): set() for c in curves}
+    taken = {key: set(() if asked is None else asked.get(key, ())) for key in recorded}
+    wanted_by_fits = set().union(*taken.values())
     out = []
     for p in table:
-        if p.auto and p.fixed and others and p.name in shown and shown[p.name].any():
+        some = p.name in wanted_by_fits or (p.name in shown and shown[p.name].any())
+        if p.auto and p.fixed and others and some:
             p = dataclasses.replace(p, fixed=False)
             for k in np.flatnonzero(shown[p.name]).tolist():
-                taken[curves[k].specimen, curves[k].trial].add(p.name)
+                recorded[curves[k].specimen, curves[k].trial].add(p.name)
         out.append(p)
-    return Resolved(_without_flat_line(out), taken, zeros)
+    taken = {key: taken[key] | recorded[key] for key in recorded}
+    return Resolved(_without_flat_line(out), taken, zeros, recorded)
 
 
 def zeros_of(
@@ -180,6 +188,8 @@ def starts_of(
         for t, curve in enumerate(group):
             key = curve.specimen, curve.trial
             for i, name in enumerate(OF_THE_PRESS):
-                if name in resolved.taken[key] or (name == "force_slope" and name in free - auto):
+                if name in resolved.recorded[key] or (
+                    name == "force_slope" and name in free - auto
+                ):
                     out[lane, t, i] = shown[i][row[key]]
-    return out
+    return None if np.isnan(out).all() else out

@@ -1,10 +1,9 @@
 """Trials that are left out together: mirror images and other twins, which tell of each other."""
 
-import dataclasses
 from collections.abc import Iterable, Sequence
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.study import Study, with_recipe
 from jaxtrachea.measurements.read import BadCurve, Curve
 
 #: Trials that a message names.
@@ -49,7 +48,7 @@ def with_holdout_groups(
                 key=str(i),
                 cure="name trials of one specimen, or leave the group out",
             )
-    return dataclasses.replace(study, holdout_groups=groups)
+    return with_recipe(study, tuple(tuple(group) for group in groups))
 
 
 def _ensure_trial(name: str, names: Sequence[str], key: str) -> None:

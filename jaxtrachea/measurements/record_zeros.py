@@ -27,7 +27,7 @@ LINE = 5
 #: Mean square residual, in variances of the noise, from which fits say nothing of a short air.
 _MISSED = 3.0
 #: Standard deviations of the force where a record begins that preload and offset need.
-_SHOWN = 2.5
+SHOWN = 2.5
 #: Standard deviations from which no fit is needed to see it.
 _OBVIOUS = 6.0
 #: Samples of a record at least, and means of neighbouring samples that it becomes at most.
@@ -47,7 +47,7 @@ _SHAPES = ((0.2, -2.0, -2.0), (-3.0, 2.0, -0.7))
 _SHAPE = ("k_1", "k_3", "c", "q")
 #: Fall of the sum of squares that the linearised press must promise for a record to be fitted on,
 #: and samples by which a short record's evidence must be the larger.
-_HINT, _FEW = 12.0, 6
+_HINT, FEW = 12.0, 6
 #: Samples from which the noise of a record is known well.
 _LONG_RECORD = 40
 #: Records looked at, and fitted, together.
@@ -160,7 +160,7 @@ def _of_equal_length(D, F, given) -> Zeros:
     air = _air(D, F, noise, touch, peak / span)
     rises = air.rise > _RISING * np.maximum(measured, _ROUNDING * peak)
     rises |= taken.missed & (touch > D[:, 0]) & (air.count < LINE)
-    rises |= (touch <= D[:, 0]) & (F[:, 0] < _SHOWN * noise)  # nor a load where there is none
+    rises |= (touch <= D[:, 0]) & (F[:, 0] < SHOWN * noise)  # nor a load where there is none
     rises &= taken.onset
     for v in (taken.onset, taken.offset, touch, level):  # no air where the force rises
         v[rises] = 0
@@ -369,13 +369,13 @@ def _separable(records: _Records, bare, rss) -> _Taken:
     raised, rss_raised = _best(records, (*_SHAPE, "force_offset"), *starts)
     unit = np.maximum(rss_both / max(n - 6, 1), 1)
     by_onset, by_offset, by_both = ((rss - v) / unit for v in (rss_moved, rss_raised, rss_both))
-    pulls = y[:, 0] * weight[:, 0] < -_SHOWN  # no tool does where it touches: an offset
+    pulls = y[:, 0] * weight[:, 0] < -SHOWN  # no tool does where it touches: an offset
     single = np.where(pulls, by_offset, np.maximum(by_onset, by_offset))
-    least = EVIDENCE * (1 + _FEW / n)
+    least = EVIDENCE * (1 + FEW / n)
     taken = (single > least) | (by_both > least + TOLD_APART)
     together = by_both - single > least
     # Nothing before the record without a force where it begins.
-    shown = np.abs(level - rise * x[:, 0]) * weight[:, 0] > _SHOWN
+    shown = np.abs(level - rise * x[:, 0]) * weight[:, 0] > SHOWN
     taken &= shown | (np.where(together, both[:, 4], moved[:, 4]) > x[:, 0])
     together &= ~pulls | (both[:, 4] > x[:, 0])
     unsure = ~pulls & ~together & (np.abs(by_offset - by_onset) < TOLD_APART)

@@ -1,0 +1,355 @@
+"""Onsets and force offsets that a record does not show, but the fit asks for.
+
+Whether a curve takes an onset or a force offset is decided before the fit, by its record alone
+(`zeros`). A soft beginning hides some air there, and the other parameters follow it: they come out
+wrong, with narrow intervals. After the fit the model itself can tell. The score (Lagrange
+multiplier) test asks whether the cost has a slope along a zero that is fixed (Rao 1948,
+doi:10.1017/S0305004100023987; Breusch and Pagan 1980, doi:10.2307/2297111): with the derivative c
+of the whitened residuals r by the zero, and M c what the Jacobian's columns leave of it,
+
+    z^2 = (c^T M r)^2 / (c^T M c) / s^2
+
+is the fall of the sum of squares, in variances of the noise, that the zero promises. s^2, and the
+independent samples that z^2 counts by (`effective`), are those of the residuals that would be left.
+Where these are still correlated, the model misses the curve and a zero is not what it lacks.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxtrachea.fitting.cost import robust
+from jaxtrachea.fitting.effective import CORRELATED, lag_correlation, share_independent
+from jaxtrachea.fitting.lane import force_entries
+from jaxtrachea.fitting.map_lanes import map_lanes
+from jaxtrachea.fitting.residual import residual_value
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
+from jaxtrachea.measurements.record_zeros import FEW, SHOWN, TOLD_APART
+
+#: z^2 from which a zero is asked for: three standard errors, by chance in 0.3 % of the curves. Less
+#: than a record must show (`record_zeros.EVIDENCE`): no shape of the press is looked for here.
+ASKED = 9.0
+#: Zeros that are looked for.
+ZEROS = ("onset", "force_offset")
+#: Differences for derivatives, relative to the size of an unknown or of the press.
+_STEP = 1e-5
+#: Part of a column that others leave below which it is a combination of them.
+_ALIKE = 1e-6
+#: Gauss-Newton steps, the first one included, after which residuals must not be correlated.
+STEPS = 4
+#: Number in `ZEROS` and trial, with the value that is promised, mm or N.
+Chosen = dict[tuple[int, int], float]
+
+
+class Asked(NamedTuple):
+    """Zeros that fits ask for.
+
+    Attributes:
+        names: by specimen and trial.
+        value: promised, mm or N; by specimen, trial and name.
+    """
+
+    names: dict[tuple[str, str], set[str]]
+    value: dict[tuple[str, str, str], float]
+
+
+class _Columns(NamedTuple):
+    """Whitened residuals of lanes that may ask, and their derivatives.
+
+    Attributes:
+        lanes: of the study.
+        residual: (n, T, m).
+        unknowns: derivative by each unknown, 0 where it is not free; (n, P, T, m).
+        zeros: by each of `ZEROS` of each trial, mm and N; (n, Z, T, m).
+    """
+
+    lanes: Int[np.ndarray, " n"]
+    residual: Float[np.ndarray, "n T m"]
+    unknowns: Float[np.ndarray, "n P T m"]
+    zeros: Float[np.ndarray, "n Z T m"]
+
+
+def asked_for(result: FitResult) -> Asked:
+    """Zeros of the curves of a fit that are fixed, `auto`, and not to be fixed by its residuals.
+
+    Costs nothing where no zero is `auto`: bonded contact, or zeros that the user names. Else the
+    model is evaluated once for each unknown, and twice, by the program of its residuals. A joint
+    fit asks for none: what one lane lacks its shared unknowns spread over the residuals of all.
+
+    Args:
+        result: the fit.
+    """
+    able = _able(result)
+    lanes = np.flatnonzero(able.any(axis=(1, 2)))
+    out = Asked({}, {})
+    if not len(lanes) or result.study.size == 0:
+        return out
+    columns = _columns(result, lanes, result.theta[lanes], result.study)
+    chosen = [_chosen(result, columns, n, able[lane]) for n, lane in enumerate(lanes)]
+    rows = np.flatnonzero([len(v) > 0 for v in chosen])
+    if not len(rows):
+        return out
+    chosen, columns = [chosen[n] for n in rows], _Columns(*(v[rows] for v in columns))
+    for lane, names, fits in zip(
+        columns.lanes, chosen, _fitting(result, columns, chosen), strict=True
+    ):
+        for (z, trial), value in names.items() if fits else ():
+            curve = result.study.curves[lane][trial]
+            out.names.setdefault((curve.specimen, curve.trial), set()).add(ZEROS[z])
+            out.value[curve.specimen, curve.trial, ZEROS[z]] = value
+    return out
+
+
+def _fitting(result: FitResult, columns: _Columns, chosen: list[Chosen]) -> list[bool]:
+    """Whether the residuals that zeros would leave are no longer correlated.
+
+    By the linear model; where it says no, by a few Gauss-Newton steps, since air of a tenth of the
+    press is far from none. A model that misses the curve anyway leaves them correlated.
+    """
+    study, lanes = result.study, columns.lanes
+    theta = result.theta[lanes].copy()
+    shift = np.zeros((len(ZEROS), *study.lanes.s_c.shape))
+    good = np.zeros(len(lanes), bool)
+    for turn in range(STEPS):
+        if turn:
+            later = study.lanes._replace(
+                displacement=study.lanes.displacement - shift[0][..., None],
+                force=study.lanes.force - shift[1][..., None],
+            )
+            columns = _columns(result, lanes, theta, dataclasses.replace(study, lanes=later))
+        for n in np.flatnonzero(~good).tolist():
+            places = list(chosen[n])
+            J, C = _rows(columns, n, places)
+            X = np.concatenate([J, C])
+            size = np.maximum(np.linalg.norm(X, axis=1), 1e-300)
+            r = columns.residual[n].ravel()
+            if not np.isfinite(X).all() or not np.isfinite(r).all():
+                continue
+            step = -np.linalg.lstsq((X / size[:, None]).T, r, rcond=1e-10)[0] / size
+            _, correlation = _unit(result, int(lanes[n]), r + step @ X, len(places))
+            good[n] = correlation <= CORRELATED
+            theta[n] += step[: len(J)]
+            for (z, t), v in zip(places, step[len(J) :], strict=True):
+                shift[z, lanes[n], t] += v
+        theta = np.clip(theta, study.lanes.lower[lanes], study.lanes.upper[lanes])
+        if good.all():
+            break
+    return good.tolist()
+
+
+def _rows(columns: _Columns, n: int, places) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the residual of lane n by the unknowns, and by the zeros of some curves."""
+    J = columns.unknowns[n].reshape(len(columns.unknowns[n]), -1)
+    C = np.zeros((len(places), *columns.residual[n].shape))
+    for k, (z, t) in enumerate(places):
+        C[k, t] = columns.zeros[n, z, t]
+    return J, C.reshape(len(places), J.shape[1])
+
+
+def _able(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
+    """Zeros that curves have not taken and might, of lanes that have an estimate to be wrong."""
+    study = result.study
+    out = np.zeros((result.lanes, len(ZEROS), study.lanes.s_c.shape[1]), bool)
+    if study.joint or study.model.options.contact != "unilateral":
+        return out
+    there = (study.lanes.precision > 0).any(axis=2)
+    for z, name in enumerate(ZEROS):
+        for j, p in enumerate(study.parameters):
+            if p.name == name and p.auto:
+                out[:, z] = there & (study.lanes.index[:, :, j] < 0)
+    if out.any():
+        out &= result.succeeded[:, None, None]
+    return out
+
+
+def _columns(result: FitResult, lanes: Int[np.ndarray, " n"], theta, study: Study) -> _Columns:
+    """Residuals and derivatives of some lanes, by differences.
+
+    Args:
+        result: whose noise and free unknowns.
+        lanes: which.
+        theta: where; (n, P).
+        study: its study, or one with shifted records.
+    """
+    relative = result.relative[lanes]
+    free = (study.lanes.active[lanes] > 0) & ~result.at_bound[lanes]
+    batch = study.batch_size(result.lanes, 256)  # as `predictions` has it: its program
+
+    def values(study: Study, theta) -> np.ndarray:
+        return map_lanes(
+            residual_value, study, theta, rows=lanes, batch=batch,
+            unoptimised=study.unoptimised(result.lanes),
+        )  # fmt: skip
+
+    base = values(study, theta)
+    weight = _weights(result, lanes, base)
+
+    def slope(study: Study, theta, step) -> np.ndarray:
+        return (values(study, theta) - base) / step[..., None] * weight
+
+    unknowns = np.zeros((len(lanes), study.size, *base.shape[1:]))
+    for i in range(study.size):
+        step = np.where(free[:, i], _STEP * relative[:, i], 1.0)
+        moved = theta.copy()
+        moved[:, i] += np.where(free[:, i], step, 0.0)
+        unknowns[:, i] = slope(study, moved, step[:, None])
+    # A tool that goes h less deep meets what one with an onset of h does.
+    D = study.lanes.displacement
+    step = _STEP * np.where(study.lanes.precision > 0, np.abs(D), 0).max(axis=2)
+    step = np.where(step > 0, step, 1.0)
+    later = study.lanes._replace(displacement=D - step[..., None])
+    by_onset = slope(dataclasses.replace(study, lanes=later), theta, step[lanes])
+    by_offset = np.zeros_like(base)
+    N = D.shape[2]
+    by_offset[..., :N] = study.lanes.precision[lanes] * weight[..., :N]
+    zeros = np.stack([by_onset, by_offset], axis=1)
+    return _Columns(lanes, base * weight, unknowns, zeros)
+
+
+def _weights(result: FitResult, lanes: Int[np.ndarray, " n"], value) -> np.ndarray:
+    """What multiplies a residual: 1 / sigma, the weight of its curve, that of a robust loss."""
+    study = result.study
+    of_force = np.arange(value.shape[2]) < force_entries(study.lanes)
+    scale = 1 / np.where(of_force, *np.split(result.whitened_sigma[lanes], 2, axis=1))
+    weight = np.asarray(study.lanes.balance)[lanes][..., None] * scale[:, None]
+    if study.model.loss == "linear":
+        return weight
+    _, slope = robust(study.model.loss, (value * scale[:, None]) ** 2, study.model.loss_scale)
+    return weight * np.sqrt(np.asarray(slope))
+
+
+def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
+    """Zeros that lane n of `columns` asks for, with their promised values.
+
+    One after the other, the one that promises most first. Where the other zero of the same curve
+    promises as much, within `TOLD_APART`, both are taken: nothing tells them apart.
+    """
+    lane = int(columns.lanes[n])
+    r = columns.residual[n].ravel()
+    places = [(int(z), int(t)) for z, t in np.argwhere(able)]
+    J, C = _rows(columns, n, places)
+    left = C - (C @ J.T) @ np.linalg.pinv(J @ J.T, rcond=1e-14, hermitian=True) @ J
+    gram, slope = C @ left.T, left @ r
+    size = np.sum(C * C, axis=1)
+    usable = np.diag(gram) > _ALIKE * size
+    chosen: list[int] = []
+    while usable.any():
+        fall, value = _promise(gram, slope, chosen)
+        possible = usable & _possible(result, lane, places, value)
+        if not possible.any():
+            break
+        best = int(np.argmax(np.where(possible, fall, -np.inf)))
+        now = [*chosen, best]
+        step = np.linalg.solve(gram[np.ix_(now, now)], slope[now])
+        unit, _ = _unit(result, lane, r - step @ left[now], len(now))
+        if not fall[best] / unit > ASKED * (1 + FEW / int(result.samples[lane])):
+            break
+        twins = [
+            k for k, (_, t) in enumerate(places)
+            if possible[k] and t == places[best][1] and (fall[best] - fall[k]) / unit < TOLD_APART
+        ]  # fmt: skip
+        chosen += twins
+        usable[twins] = False
+    if not chosen:
+        return {}
+    value = -np.linalg.lstsq(gram[np.ix_(chosen, chosen)], slope[chosen], rcond=1e-10)[0]
+    return {places[k]: float(v) for k, v in zip(chosen, value, strict=True)}
+
+
+def _promise(gram, slope, chosen: list[int]):
+    """Fall of the sum of squares by each zero beside the chosen ones, and its value."""
+    if chosen:
+        inner = np.linalg.pinv(gram[np.ix_(chosen, chosen)], hermitian=True)
+        slope = slope - gram[:, chosen] @ (inner @ slope[chosen])
+        own = np.diag(gram) - np.einsum("ki,ij,kj->k", gram[:, chosen], inner, gram[:, chosen])
+    else:
+        own = np.diag(gram)
+    own = np.where(own > _ALIKE * np.diag(gram), own, np.inf)
+    return slope**2 / own, -slope / own
+
+
+def _possible(result: FitResult, lane: int, places, value) -> Bool[np.ndarray, " K"]:
+    """Whether a record may have such a zero: none before its first sample without a force there."""
+    lanes, sigma = result.study.lanes, float(result.sigma[lane, 0])
+    out = np.ones(len(places), bool)
+    for k, (z, t) in enumerate(places):
+        if ZEROS[z] == "onset":
+            seen = np.flatnonzero(lanes.precision[lane, t] > 0)
+            first = seen[np.argmin(lanes.displacement[lane, t, seen])]
+            begins = abs(float(lanes.force[lane, t, first])) > SHOWN * sigma
+            out[k] = value[k] > lanes.displacement[lane, t, first] or begins
+    return out
+
+
+def _unit(result: FitResult, lane: int, r: Float[np.ndarray, " m"], taken: int):
+    """Fall of the sum of squares that counts as one variance of independent noise.
+
+    And the correlation of neighbours, 0 with too few.
+    """
+    study = result.study
+    precision = study.lanes.precision[lane]
+    left = int(result.samples[lane]) - int(np.sum(study.lanes.active[lane] > 0)) - taken
+    variance = float(r @ r) / max(left, 1)
+    if study.noise_known[lane]:
+        variance = max(variance, 1.0)
+    force = r.reshape(len(precision), -1)[:, : precision.shape[1]]
+    force = np.where(precision > 0, force, np.nan)[None]
+    pairs = np.sum(np.isfinite(force[..., 1:]) & np.isfinite(force[..., :-1]), axis=(1, 2))
+    correlation = np.nan_to_num(lag_correlation(force))
+    share = share_independent(correlation, np.maximum(pairs, 1))
+    return variance / float(share[0]), float(correlation[0])
+
+
+def near_estimates(result: FitResult, again: Study, asked: Asked) -> Float[np.ndarray, "lanes P"]:
+    """The estimates of a fit, with what further zeros promise, as starts of the study with them."""
+    out = np.full(again.lanes.lower.shape, np.nan)
+    for lane, unknowns in enumerate(again.unknowns):
+        before = {(p.name, *of): i for i, (p, *of) in enumerate(result.study.unknowns[lane])}
+        for i, (p, specimen, trial) in enumerate(unknowns):
+            j = before.get((p.name, specimen, trial))
+            value = asked.value.get((specimen, trial, p.name), np.nan)
+            if j is not None:
+                value = float(result.value[lane, j])
+            if np.isfinite(value) and (value > 0 or p.scale != "log"):
+                out[lane, i] = p.to_scaled(value)
+    return np.clip(out, again.lanes.lower, again.lanes.upper)
+
+
+#: Fields of a result that are 0, not NaN, where a lane has fewer unknowns than others.
+_ZERO = (
+    "theta", "weakest_direction", "structural_null_space", "conditional_direction", "covariance",
+    "null_space",
+)  # fmt: skip
+
+
+def merged(study: Study, result: FitResult, rows: Int[np.ndarray, " n"], new: FitResult):
+    """A result in which some lanes are fitted with more unknowns, the others as they were.
+
+    Args:
+        study: of all lanes, with these unknowns.
+        result: of all lanes without.
+        rows: lanes of `new`.
+        new: of these lanes.
+    """
+
+    def both(name, old, other):
+        more = [(0, 0), *((0, b - a) for a, b in zip(old.shape[1:], other.shape[1:], strict=True))]
+        blank = 0 if name in _ZERO or old.dtype == bool else -1 if old.dtype.kind == "i" else np.nan
+        out = np.pad(old, more, constant_values=blank)
+        out[rows] = other
+        return out
+
+    def every(names, old, other):
+        return {n: both(n, getattr(old, n), getattr(other, n)) for n in names}
+
+    arrays = [f.name for f in dataclasses.fields(result)]
+    arrays = [n for n in arrays if isinstance(getattr(result, n), np.ndarray)]
+    records = {
+        name: type(old)(**every(old._fields, old, getattr(new, name)))
+        for name in ("criteria", "uncertainty")
+        for old in [getattr(result, name)]
+    }
+    return dataclasses.replace(result, study=study, **every(arrays, result, new), **records)
