@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon, picked
-from jaxtrachea.mechanics.beam import back_substitute, both_sides, sweep
-from jaxtrachea.mechanics.compliance import Beam, divide_load
+from jaxtrachea.mechanics.beam import Side, both_sides, sweep
+from jaxtrachea.mechanics.compliance import Beam, Compliance, join, sides
 from jaxtrachea.mechanics.marks import with_marks, without_marks
 
 
@@ -48,40 +48,36 @@ def influence(beam: Beam, s: Float[Array, " m"]) -> Influence:
     """
     order, place = _sorted_places(s)
     marked, passed, marks = with_marks(beam, picked(s, order))
+    marks = picked(marks, place)
     m, supports = s.shape[0], marked.x.shape[0]
     both = both_sides(marked)
     _, nodes, past = jax.vmap(sweep)(both)
-    index = jnp.arange(supports)
     at = jnp.stack([marks, supports - 1 - marks])  # seen from A, and from B
+    tips = jax.tree.map(lambda v: jax.vmap(picked)(v, at), nodes.g)
+    joint = jax.vmap(lambda tip: join(*sides(tip)), in_axes=1)(tips)
+    w = jax.vmap(_back_substitute)(both, nodes.g, past, at, joint.V.T, joint.M.T)
+    w = jnp.where(jnp.arange(supports)[:, None] <= marks[None], w[0], w[1][::-1])
+    C = w[marks]
+    C = jnp.where(jnp.eye(m, dtype=bool), joint.w[:, None], (C + C.T) / 2)
+    joints = without_marks(w, passed, m).T
+    return Influence(C, joints, joints * beam.k[None])
 
-    def load(at):
-        """Motions of all supports under a unit force at a mark, seen from both sides."""
-        tips = jax.tree.map(lambda v: jnp.stack([picked(v[i], at[i]) for i in (0, 1)]), nodes.g)
-        far = jnp.stack([marked.length, marked.length])  # of no meaning for this split
-        w_C, _, V, M = divide_load(tips, far, jnp.ones_like(s[0]), "continuous")
-        beyond = index[None] > at[:, None]
-        h = jnp.where(index[None] < at[:, None], both.h[:, 1:], 0)
-        cut = both._replace(
-            h=jnp.concatenate([both.h[:, :1], h], axis=1), k=jnp.where(beyond, 0, both.k)
-        )
-        w, _, R = jax.vmap(back_substitute)(cut, nodes, jnp.where(beyond, 1, past), V, M)
 
-        def join(v):
-            return jnp.where(index <= at[0], v[0], v[1][::-1])
+def _back_substitute(side: Side, tips: Compliance, past, at, V, M) -> Float[Array, "supports m"]:
+    """From m loads (V, M), each at its mark, back to the clamp: motion of every support, mm.
 
-        return w_C, join(w), join(R)
+    Nothing moves beyond a mark here: that is for the other side.
+    """
 
-    w_C, w, R = jax.vmap(load, in_axes=1)(at)
-    C = jax.vmap(lambda v: picked(v, marks))(w)
-    C = jnp.where(jnp.eye(m, dtype=bool), w_C[:, None], (C + C.T) / 2)
+    def step(load, support):
+        index, h, k, past, a, b = support
+        begins = index == at
+        M_here = jnp.where(begins, M, load[1] + h * load[0])
+        V_here = jnp.where(begins, V, load[0])
+        return (past * V_here - k * b * M_here, M_here), a * V_here + b * M_here
 
-    def in_order(v):
-        return picked(v.T, place).T
-
-    def per_ring(v):
-        return in_order(jax.vmap(lambda row: without_marks(row, passed, m))(v))
-
-    return Influence(in_order(in_order(C).T), per_ring(w), per_ring(R))
+    supports = (jnp.arange(side.k.shape[0]), side.h[1:], side.k, past, tips.a, tips.b)
+    return jax.lax.scan(step, (jnp.zeros_like(V), jnp.zeros_like(M)), supports, reverse=True)[1]
 
 
 def level_influence(beam: Beam, s: Float[Array, " m"], half_width: float) -> Influence:

@@ -7,6 +7,10 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea.mechanics.compliance import Beam
 
+#: Marks up to which values are chosen by comparisons, which go back as choices and fit one kernel
+#: (`fusion.fuse`); a gather goes back as a scatter. Of more marks that would be most of the work.
+FEW = 2
+
 
 def with_marks(
     beam: Beam, places: Float[Array, " m"]
@@ -30,9 +34,10 @@ def with_marks(
     before = jnp.sum(mark[None] < place[:, None], axis=1)
 
     def spread(v, before):
-        """Each as far behind as marks stand before it; no gather, which goes back as a scatter."""
-        shifts = [jnp.pad(v, (i, m - i)) for i in range(m + 1)]
-        return _chosen(before, shifts)
+        """Each as far behind as marks stand before it."""
+        if m > FEW:
+            return v[jnp.minimum(jnp.arange(before.shape[0]) - before, v.shape[0] - 1)]
+        return _chosen(before, [jnp.pad(v, (i, m - i)) for i in range(m + 1)])
 
     is_mark = [place[:-1] == at for at in mark]
     x, k = (spread(v, before[:-1]) for v in (beam.x, beam.k))
@@ -54,6 +59,8 @@ def without_marks(
         marks: how many there are.
     """
     n = passed.shape[0]
+    if marks > FEW:
+        return v[jnp.arange(n) + passed]
     return _chosen(passed, [v[i : n + i] for i in range(marks + 1)])
 
 
@@ -61,5 +68,5 @@ def _chosen(count: Int[Array, "*n"], values: list[Array]) -> Array:
     """`values[count]`, entry by entry; the last where `count` is none of the others."""
     out = values[-1]
     for i in reversed(range(len(values) - 1)):
-        out = jnp.where(count == i, values[i], out)
+        out = jnp.where((count == i).reshape(-1, *[1] * (out.ndim - 1)), values[i], out)
     return out
