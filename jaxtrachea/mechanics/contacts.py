@@ -23,14 +23,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon, every, largest, positive_part, product
-from jaxtrachea.mechanics.equilibrium import press_series
 from jaxtrachea.mechanics.force_law import Law, fold_depth
 from jaxtrachea.status import PressStatus
 
 #: Newton steps at most; 1,000 random scenes of six contacts take 8 in the median, 20 at most.
 STEPS = 40
 #: Steps of false position along one Newton step.
-SEARCH = 5
+SEARCH = 8
+#: Contacts up to which the elimination of one step is written out.
+UNROLLED = 4
 
 
 class ContactForces(NamedTuple):
@@ -115,49 +116,41 @@ def solve(
         1 / epsilon); no contact has a number then, nor where one input is not finite.
     """
     m = displacement.shape[0]
-    law = law._replace(**{n: jnp.broadcast_to(k, (m,)) for n, k in law.coefficients().items()})
     there = jnp.ones(m, bool) if present is None else present
-    both = there[:, None] & there[None]
-    D, C = jnp.where(there, displacement, 0), jnp.where(both, compliance, 0)
+    D = jnp.where(there, displacement, 0)
+    C = jnp.where(there[:, None] & there[None], compliance, 0)
     law = law._replace(**{n: jnp.where(there, k, 1) for n, k in law.coefficients().items()})
-    given = jnp.sum(D) + jnp.sum(C) + sum(jnp.sum(k) for k in law.coefficients().values())
-    known = jnp.isfinite(given)
+    known = jnp.isfinite(jnp.sum(D) + jnp.sum(C) + sum(map(jnp.sum, law.coefficients().values())))
     D, C = jnp.where(known, D, 0), jnp.where(known, C, 0)
     law = law._replace(**{n: jnp.where(known, k, 1) for n, k in law.coefficients().items()})
 
-    own = press_series(D if width is None else jnp.maximum(D, 0), jnp.diag(C), _cubic(law)).force
-    if start is not None:
-        own = jnp.where(there & jnp.isfinite(start), start, own)
     contacts = _Contacts(law, fold_depth(law), width)
-    depth, force, steps, moved = _newton(*jax.lax.stop_gradient((D, C, contacts, own)))
+    alone = _pressing(D, width) * law.k_1 / (1 + jnp.diag(C) * law.k_1)
+    if start is not None:
+        alone = jnp.where(there & jnp.isfinite(start), start, alone)
+    depth, force, steps, moved = _newton(*jax.lax.stop_gradient((D, C, contacts, alone)))
     depth, force = _follow(D, C, contacts, depth, force)
 
-    pressed = contacts.pressed(depth)[0]
-    past = ~every(jnp.abs(pressed) < contacts.peak)
-    size, eps = _size(D, width), epsilon(D.dtype)
+    past = ~every(jnp.abs(contacts.pressed(depth)[0]) < contacts.peak)
+    eps = epsilon(D.dtype)
     # Indentations below the rounding of D: neither touch nor force is known.
     stiffness = jnp.maximum(contacts.tangent(depth), law.k_1)
-    done = (moved <= 64 * eps * size) & (largest(stiffness * jnp.diag(C)) * eps < 0.1)
-    lifted = (D > 0) if width is not None else jnp.zeros_like(there)
+    balanced = moved <= 64 * eps * largest(jnp.abs(_pressing(D, width)))
+    balanced = balanced & (largest(stiffness * jnp.diag(C)) * eps < 0.1)
+    lifted = there & (D > 0) & (width is not None)
     status = jnp.where(lifted, PressStatus.LIFTED, PressStatus.NO_CONTACT)
-    status = jnp.where(there & (force == 0), status, PressStatus.OK)
-    status = jnp.where(there, status, PressStatus.NO_CONTACT)
-    status = jnp.where(done, status, PressStatus.NOT_CONVERGED)
+    status = jnp.where(there & (force != 0), PressStatus.OK, status)
+    status = jnp.where(balanced, status, PressStatus.NOT_CONVERGED)
     status = jnp.where(past, PressStatus.PAST_FOLD, status)
     status = jnp.where(known, status, PressStatus.NON_FINITE).astype(jnp.int8)
-    solved = known & done & ~past
+    solved = known & balanced & ~past
     depth, force = (jnp.where(solved, v, jnp.nan) for v in (depth, force))
     return ContactForces(depth, force, status, steps)
 
 
-def _cubic(law: Law) -> Law:
-    """A law that hardens and has a closed form in series, to begin with."""
-    return Law(law.k_1, jnp.maximum(law.k_3, 0))
-
-
-def _size(D, width):
-    """Largest displacement that presses (or pulls), mm: what rounding is a share of."""
-    return largest(jnp.abs(D if width is None else jnp.maximum(D, 0)))
+def _pressing(D, width):
+    """The part of each displacement that presses (or pulls), mm."""
+    return D if width is None else jnp.maximum(D, 0)
 
 
 def _newton(D, C, contacts: _Contacts, start):
@@ -169,7 +162,7 @@ def _newton(D, C, contacts: _Contacts, start):
     towards `start`, as far as the energy falls: forces of contacts that do not know each other may
     lift the wall far beyond all tools.
     """
-    tolerance = 16 * epsilon(D.dtype) * _size(D, contacts.width)
+    tolerance = 16 * epsilon(D.dtype) * largest(jnp.abs(_pressing(D, contacts.width)))
 
     def step(state):
         count, g, _, _, _ = state
@@ -177,7 +170,7 @@ def _newton(D, C, contacts: _Contacts, start):
         d = D - u
         f = contacts.force(d)
         root = _root(contacts.tangent(d))
-        y = _solve_ldl(_stiffened(C, root), (root * (u - product(C, f)))[:, None])[:, 0]
+        y = _eliminate(_stiffened(C, root), (root * (u - product(C, f)))[:, None])[:, 0]
         force = f + root * y
         first = count == 0
         change = jnp.where(first, start, force - g)
@@ -194,31 +187,25 @@ def _newton(D, C, contacts: _Contacts, start):
     none = jnp.zeros_like(start)
     begin = jnp.zeros((), int), none, none, D, jnp.full_like(tolerance, jnp.inf)
     count, _, force, depth, moved = jax.lax.while_loop(goes, step, begin)
+    force = force if contacts.width is None else jnp.maximum(force, 0)  # not -1e-17
     return depth, force, count, moved
 
 
 def _length(contacts: _Contacts, d, g, change, move):
     """How much of a step to take: all, or up to where the energy along it is least.
 
-    dE/dt rises along a step, with corners where contacts touch or let go: the two corners between
-    which it is 0 are found first, then the zero between them.
+    dE/dt rises along a step, with corners where contacts touch or let go, so that its zero stays in
+    a bracket; the part up to the lower end of that never raises the energy.
     """
     constant, linear = jnp.sum(move * g), jnp.sum(move * change)
 
     def slope(t):
         return constant + t * linear - jnp.sum(move * contacts.force(d - t * move))
 
-    zero, one = jnp.zeros_like(constant), jnp.ones_like(constant)
-    first, last = slope(zero), slope(one)
-    moves = move != 0
-    at = jnp.clip(jnp.where(moves, d / jnp.where(moves, move, 1), 1), 0, 1)
-    there = jax.vmap(slope)(at)
-    before = there <= 0
-    low, high = jnp.max(jnp.where(before, at, 0)), jnp.min(jnp.where(before, 1, at))
-    at_low = jnp.max(jnp.where(before & (at >= low), there, jnp.where(low > 0, -jnp.inf, first)))
-    at_high = jnp.min(jnp.where(~before & (at <= high), there, jnp.where(high < 1, jnp.inf, last)))
+    none, all_of_it = jnp.zeros_like(constant), jnp.ones_like(constant)
+    first, last = slope(none), slope(all_of_it)
 
-    def halve(_, bracket):
+    def narrow(_, bracket):
         low, at_low, high, at_high = bracket
         wide, rise = high - low, at_high - at_low
         t = low - at_low * wide / jnp.where(rise > 0, rise, 1)
@@ -228,8 +215,9 @@ def _length(contacts: _Contacts, d, g, change, move):
         low, at_low = jnp.where(left, t, low), jnp.where(left, here, at_low)
         return low, at_low, jnp.where(left, high, t), jnp.where(left, at_high, here)
 
-    low, _, high, _ = jax.lax.fori_loop(0, SEARCH, halve, (low, at_low, high, at_high))
-    return jnp.where(last > 0.5 * jnp.abs(first), jnp.where(low > 0, low, high), one)
+    bracket = none, jnp.minimum(first, 0), all_of_it, last
+    low, _, high, _ = jax.lax.fori_loop(0, SEARCH, narrow, bracket)
+    return jnp.where(last > 0.5 * jnp.abs(first), jnp.where(low > 0, low, high), all_of_it)
 
 
 @jax.custom_jvp
@@ -258,7 +246,7 @@ def _follow_jvp(primals, tangents):
     given = d_D - product(d_C, F)
     over = jnp.where(on, own / jnp.where(on, root, 1), 0)
     rows = jnp.stack([over + root * given, root * (given - product(C, own))], axis=1)
-    z, y = _solve_ldl(_stiffened(C, root), rows).T
+    z, y = _eliminate(_stiffened(C, root), rows).T
     d_force = root * z
     d_depth = jnp.where(on, y / jnp.where(on, root, 1), given - product(C, d_force))
     return (depth, force), (d_depth, d_force)
@@ -273,21 +261,21 @@ def _stiffened(C, root):
     return jnp.eye(root.shape[0], dtype=C.dtype) + root[:, None] * C * root[None]
 
 
-def _solve_ldl(matrix: Float[Array, "m m"], rhs: Float[Array, "m r"]) -> Float[Array, "m r"]:
-    """Solve a system without eigenvalues below 1 by L D L^T, row after row of all lanes at once.
+def _eliminate(matrix: Float[Array, "m m"], rhs: Float[Array, "m r"]) -> Float[Array, "m r"]:
+    """Solve a symmetric system without eigenvalues below 1, all lanes at once (Gauss and Jordan).
 
     No pivot is below 1 either, but by rounding.
     """
-    m, columns, pivots, rest = rhs.shape[0], [], [], matrix
-    for i in range(m):
-        pivot = jnp.where(rest[i, i] < 1, 1, rest[i, i])
-        below = jnp.where(jnp.arange(m) > i, rest[:, i] / pivot, 0)
-        columns.append(below)
-        pivots.append(pivot)
-        rhs = rhs - below[:, None] * rhs[i][None]
-        rest = rest - below[:, None] * rest[i][None]
-    x = rhs / jnp.stack(pivots)[:, None]
-    for i in reversed(range(m)):
-        passed = jnp.sum(columns[i][:, None] * x, axis=0)
-        x = jnp.where((jnp.arange(m) == i)[:, None], x - passed[None], x)
-    return x
+    m = rhs.shape[0]
+    rows = jnp.arange(m)
+
+    def step(i, table):
+        pivot = jax.lax.dynamic_index_in_dim(table, i, keepdims=False)
+        own = jax.lax.dynamic_index_in_dim(pivot, i, keepdims=False)
+        pivot = pivot / jnp.where(own < 1, 1, own)
+        factor = jax.lax.dynamic_index_in_dim(table, i, axis=1, keepdims=False)
+        others = table - factor[:, None] * pivot[None]
+        return jnp.where((rows == i)[:, None], pivot[None], others)
+
+    table = jnp.concatenate([matrix, rhs], axis=1)
+    return jax.lax.fori_loop(0, m, step, table, unroll=m <= UNROLLED)[:, m:]
