@@ -128,15 +128,16 @@ def solve(
     alone = _pressing(D, width) * law.k_1 / (1 + jnp.diag(C) * law.k_1)
     if start is not None:
         alone = jnp.where(there & jnp.isfinite(start), start, alone)
-    depth, force, steps, moved = _newton(*jax.lax.stop_gradient((D, C, contacts, alone)))
+    depth, force, steps, missed = _newton(*jax.lax.stop_gradient((D, C, contacts, alone)))
     depth, force = _follow(D, C, contacts, depth, force)
 
     past = ~every(jnp.abs(contacts.pressed(depth)[0]) < contacts.peak)
     eps = epsilon(D.dtype)
-    # Indentations below the rounding of D: neither touch nor force is known.
-    stiffness = jnp.maximum(contacts.tangent(depth), law.k_1)
-    balanced = moved <= 64 * eps * largest(jnp.abs(_pressing(D, width)))
-    balanced = balanced & (largest(stiffness * jnp.diag(C)) * eps < 0.1)
+    # Indentations below the rounding of D, or of motions that cancel: neither is known.
+    stiffness = largest(jnp.maximum(contacts.tangent(depth), law.k_1) * jnp.diag(C))
+    moved = largest(product(jnp.abs(C), jnp.abs(force)))
+    known_motion = moved * eps <= 1e-4 * largest(jnp.abs(_pressing(D, width)))
+    balanced = (missed <= 64 * eps) & (stiffness * eps < 0.1) & known_motion
     lifted = there & (D > 0) & (width is not None)
     status = jnp.where(lifted, PressStatus.LIFTED, PressStatus.NO_CONTACT)
     status = jnp.where(there & (force != 0), PressStatus.OK, status)
@@ -154,7 +155,7 @@ def _pressing(D, width):
 
 
 def _newton(D, C, contacts: _Contacts, start):
-    """Indentations, forces, steps, and the motion of the skeleton in the last step, mm.
+    """Indentations, forces, steps, and how far the last one went, as a share of all motions.
 
     A step is F = f(d) + (E^-1 + C)^-1 (D - C f(d) - d), E = f'(d), at d = D - C g: the forces of
     the laws made straight at d. It subtracts nothing that is large, however stiff a law, so that
@@ -162,7 +163,7 @@ def _newton(D, C, contacts: _Contacts, start):
     towards `start`, as far as the energy falls: forces of contacts that do not know each other may
     lift the wall far beyond all tools.
     """
-    tolerance = 16 * epsilon(D.dtype) * largest(jnp.abs(_pressing(D, contacts.width)))
+    size = largest(jnp.abs(_pressing(D, contacts.width)))
 
     def step(state):
         count, g, _, _, _ = state
@@ -178,17 +179,18 @@ def _newton(D, C, contacts: _Contacts, start):
         # Where the slope is 0 the law is straight, and level: the skeleton's motion remains.
         depth = jnp.where(root > 0, d + y / jnp.where(root > 0, root, 1), d - move)
         new = g + _length(contacts, d, g, change, move) * change
-        moved = jnp.where(first, jnp.inf, largest(jnp.abs(move)))
-        return count + 1, new, force, depth, moved
+        whole = jnp.maximum(size, largest(product(jnp.abs(C), jnp.abs(force))))
+        missed = largest(jnp.abs(move)) / jnp.where(whole > 0, whole, 1)
+        return count + 1, new, force, depth, jnp.where(first, jnp.inf, missed)
 
     def goes(state):
-        return (state[0] < STEPS) & ~(state[-1] <= tolerance)
+        return (state[0] < STEPS) & ~(state[-1] <= 16 * epsilon(D.dtype))
 
     none = jnp.zeros_like(start)
-    begin = jnp.zeros((), int), none, none, D, jnp.full_like(tolerance, jnp.inf)
-    count, _, force, depth, moved = jax.lax.while_loop(goes, step, begin)
+    begin = jnp.zeros((), int), none, none, D, jnp.full_like(size, jnp.inf)
+    count, _, force, depth, missed = jax.lax.while_loop(goes, step, begin)
     force = force if contacts.width is None else jnp.maximum(force, 0)  # not -1e-17
-    return depth, force, count, moved
+    return depth, force, count, missed
 
 
 def _length(contacts: _Contacts, d, g, change, move):
