@@ -269,15 +269,18 @@ def _eliminate(matrix: Float[Array, "m m"], rhs: Float[Array, "m r"]) -> Float[A
     No pivot is below 1 either, but by rounding.
     """
     m = rhs.shape[0]
-    rows = jnp.arange(m)
+    rows = jnp.arange(m)[:, None]
 
-    def step(i, table):
-        pivot = jax.lax.dynamic_index_in_dim(table, i, keepdims=False)
-        own = jax.lax.dynamic_index_in_dim(pivot, i, keepdims=False)
-        pivot = pivot / jnp.where(own < 1, 1, own)
-        factor = jax.lax.dynamic_index_in_dim(table, i, axis=1, keepdims=False)
-        others = table - factor[:, None] * pivot[None]
-        return jnp.where((rows == i)[:, None], pivot[None], others)
+    def step(i, system):
+        matrix, rhs = system
+        row, given = (jax.lax.dynamic_index_in_dim(v, i) for v in (matrix, rhs))
+        factor = jax.lax.dynamic_index_in_dim(matrix, i, axis=1)
+        own = jax.lax.dynamic_index_in_dim(row, i, axis=1)
+        own = jnp.where(own < 1, 1, own)
+        row, given = row / own, given / own
+        return (
+            jnp.where(rows == i, row, matrix - factor * row),
+            jnp.where(rows == i, given, rhs - factor * given),
+        )
 
-    table = jnp.concatenate([matrix, rhs], axis=1)
-    return jax.lax.fori_loop(0, m, step, table, unroll=m <= UNROLLED)[:, m:]
+    return jax.lax.fori_loop(0, m, step, (matrix, rhs), unroll=m <= UNROLLED)[1]

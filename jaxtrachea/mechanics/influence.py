@@ -48,7 +48,7 @@ def influence(beam: Beam, s: Float[Array, " m"]) -> Influence:
     """
     order, place = _sorted_places(s)
     marked, passed, marks = with_marks(beam, picked(s, order))
-    marks = picked(marks, place)
+    marks = marks[place]  # in the order of s
     m, supports = s.shape[0], marked.x.shape[0]
     both = both_sides(marked)
     _, nodes, past = jax.vmap(sweep)(both)

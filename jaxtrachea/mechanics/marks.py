@@ -49,12 +49,12 @@ def with_marks(
 
 
 def without_marks(
-    v: Float[Array, " supports"], passed: Int[Array, " n"], marks: int
-) -> Float[Array, " n"]:
+    v: Float[Array, "..."], passed: Int[Array, " n"], marks: int
+) -> Float[Array, "..."]:
     """Of all supports those that are no marks.
 
     Args:
-        v: one value for each support of the beam with marks.
+        v: values for each support of the beam with marks, on the first axis.
         passed: how many marks stand before each support without them, from `with_marks`.
         marks: how many there are.
     """
@@ -64,8 +64,8 @@ def without_marks(
     return _chosen(passed, [v[i : n + i] for i in range(marks + 1)])
 
 
-def _chosen(count: Int[Array, "*n"], values: list[Array]) -> Array:
-    """`values[count]`, entry by entry; the last where `count` is none of the others."""
+def _chosen(count: Int[Array, " n"], values: list[Array]) -> Array:
+    """`values[count]`, row by row; the last where `count` is none of the others."""
     out = values[-1]
     for i in reversed(range(len(values) - 1)):
         out = jnp.where((count == i).reshape(-1, *[1] * (out.ndim - 1)), values[i], out)
