@@ -164,8 +164,8 @@ def test_cantilever_reference():
     """
     k, bending = jnp.full(15, 0.1), jnp.full(16, 1.86)
     h = jnp.asarray([10.0] * 15 + [5.0])
-    side = room._Side(h, bending, None, k, None)
-    last, nodes, passed = room._sweep(side)
+    side = room.Side(h, bending, None, k, None)
+    last, nodes, passed = room.sweep(side)
     force, zero = jnp.asarray(0.1), jnp.zeros(())
     _, _, R = room._back_substitute(side, nodes, passed, force, zero)
     np.testing.assert_allclose(room._tip(side, last).g.a * force, CANTILEVER_TIP, rtol=5e-13)

@@ -9,14 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, last_axis, shaped
 from jaxtrachea._numerics import product_of_rows
-from jaxtrachea.mechanics.admission import (
-    Validated,
-    admit,
-    check_shapes,
-    float_type,
-    hide,
-    status_of,
-)
+from jaxtrachea.mechanics.admission import admit, check_shapes, float_type, hide, status_of
 from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.influence import influence, level_influence
 from jaxtrachea.mechanics.levels.options import Options, check_line
@@ -142,7 +135,7 @@ def _press_contacts(
     s_c = jnp.where(present, s_c, geometry.length / 2)
     onset = jnp.where(present, onset, 0)
     material, s_c, refused = jax.vmap(
-        lambda s: admit(geometry, material, s, used, reach=half), out_axes=Validated(None, 0, 0)
+        lambda s: tuple(admit(geometry, material, s, used, reach=half)), out_axes=(None, 0, 0)
     )(s_c)
     refused = jnp.max(refused)
     beam = ligament_beam(geometry, material, options)
