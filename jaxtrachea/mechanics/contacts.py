@@ -30,8 +30,6 @@ from jaxtrachea.status import PressStatus
 STEPS = 40
 #: Steps of false position along one Newton step.
 SEARCH = 8
-#: Contacts up to which the elimination of one step is written out.
-UNROLLED = 4
 
 
 class ContactForces(NamedTuple):
@@ -266,7 +264,8 @@ def _stiffened(C, root):
 def _eliminate(matrix: Float[Array, "m m"], rhs: Float[Array, "m r"]) -> Float[Array, "m r"]:
     """Solve a symmetric system without eigenvalues below 1, all lanes at once (Gauss and Jordan).
 
-    No pivot is below 1 either, but by rounding.
+    No pivot is below 1 either, but by rounding. A loop: written out, XLA for CPUs makes one kernel
+    of all steps and computes each anew for the next.
     """
     m = rhs.shape[0]
     rows = jnp.arange(m)[:, None]
@@ -283,4 +282,4 @@ def _eliminate(matrix: Float[Array, "m m"], rhs: Float[Array, "m r"]) -> Float[A
             jnp.where(rows == i, given, rhs - factor * given),
         )
 
-    return jax.lax.fori_loop(0, m, step, (matrix, rhs), unroll=m <= UNROLLED)[1]
+    return jax.lax.fori_loop(0, m, step, (matrix, rhs))[1]

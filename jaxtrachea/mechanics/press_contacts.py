@@ -134,9 +134,8 @@ def _press_contacts(
     used, half = read_values(options), options.half_width
     s_c = jnp.where(present, s_c, geometry.length / 2)
     onset = jnp.where(present, onset, 0)
-    material, s_c, refused = jax.vmap(
-        lambda s: tuple(admit(geometry, material, s, used, reach=half)), out_axes=(None, 0, 0)
-    )(s_c)
+    s_c, refused = jax.vmap(lambda s: admit(geometry, material, s, used, reach=half)[1:])(s_c)
+    material = admit(geometry, material, s_c[0], used).material
     refused = jnp.max(refused)
     beam = ligament_beam(geometry, material, options)
     unit = influence(beam, s_c) if half == 0 else level_influence(beam, s_c, half)
