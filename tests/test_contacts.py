@@ -69,7 +69,7 @@ PLACES = [[75.0, 30.0, 33.0, 30.0, 151.0, 2.0], [20.0, 10.0, 10.0, 90.0, 90.001,
 
 @pytest.mark.parametrize("shear", [True, *late(False)])
 def test_influence_against_finite_elements(shear):
-    for s in PLACES:
+    for s in (*PLACES, [33.0, 30.0]):
         got = responses(np.asarray(s), K, EI, shear=shear)
         C, w = by_elements(s, s, shear)
         np.testing.assert_allclose(got.compliance, C, rtol=0, atol=1e-12 * C.max())
@@ -211,9 +211,10 @@ def test_a_start_changes_the_steps_alone():
 
 @on_host
 @functools.partial(jax.jit, static_argnames="options")
-def pressed(s, D, values, present, *, options=Options()):
+def pressed(s, D, values, present, onset=0.0, *, options=Options()):
     """`press_contacts` on the tube of Table 1."""
-    return press_contacts(table_1(), Material(**values), s, D, options, present=present)
+    onset, material = jnp.broadcast_to(onset, s.shape), Material(**values)
+    return press_contacts(table_1(), material, s, D, options, onset=onset, present=present)
 
 
 @on_host
@@ -266,6 +267,12 @@ def test_neighbours_lift_the_wall_off_a_third():
     assert both.status[2] == NO_CONTACT
     balance = NEAR - found.depth - np.asarray(found.compliance) @ found.force
     np.testing.assert_allclose(balance, 0, atol=1e-14)
+
+
+def test_onset_is_where_each_first_touches():
+    onset = np.array([0.5, -0.25, 1.0, 2.0])
+    found = pressed(S, NEAR + onset, VALUES, ALL, onset)
+    np.testing.assert_allclose(found.force, pressed(S, NEAR, VALUES, ALL).force, rtol=1e-13)
 
 
 def test_the_order_of_tools_does_not_matter():
