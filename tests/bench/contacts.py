@@ -48,7 +48,7 @@ def compiled(function, *given):
 
 def main():
     """Print ratios of medians."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Several contacts against one")
     parser.add_argument("--lanes", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=40)
     asked = parser.parse_args()
