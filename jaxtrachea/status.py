@@ -58,6 +58,8 @@ class PressStatus(_Described):
         "factors were found: forces up to 30 % off; fit them to presses of this tube",
     )
     BACK_IN_TIME = 15, "the time is before that of an earlier sample, or no number"
+    LIFTED = 16, "another tool holds the wall away from this one: no force"
+    NOT_CONVERGED = 17, "the contacts are not in balance: too stiff for these digits; use float64"
 
     @property
     def solved(self) -> bool:
@@ -69,6 +71,7 @@ class PressStatus(_Described):
             PressStatus.TOO_DEEP,
             PressStatus.NEAR_RING_END,
             PressStatus.EXTRAPOLATED,
+            PressStatus.LIFTED,
         )
 
 

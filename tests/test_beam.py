@@ -174,8 +174,8 @@ def test_cantilever_reference():
 
     @jax.jit
     def solved(force):
-        side = room._Side(h, bending, None, k, None)
-        last, nodes, passed = room._sweep(side)
+        side = room.Side(h, bending, None, k, None)
+        last, nodes, passed = room.sweep(side)
         _, _, R = room._back_substitute(side, nodes, passed, force, jnp.zeros(()))
         return room._tip(side, last).g.a * force, R
 

@@ -41,7 +41,7 @@ Form = Literal["recursion", "reactions"]
 FEW = 32
 
 
-class _Side(NamedTuple):
+class Side(NamedTuple):
     """One side seen from its clamp: spans, rings and loads in that order.
 
     `h`, `EI`, `GA`: n + 1 spans; `k`, `load`: n rings. None: without shear, without ring loads.
@@ -68,7 +68,7 @@ def _add_span(node: _Node, h, EI, GA) -> _Node:
     return _Node(add_span(node.g, h, EI, GA), free)
 
 
-def _sweep(side: _Side) -> tuple[_Node, _Node, Float[Array, " n"]]:
+def sweep(side: Side) -> tuple[_Node, _Node, Float[Array, " n"]]:
     """Carry the compliance from the clamp over all rings.
 
     Returns:
@@ -94,7 +94,7 @@ def _sweep(side: _Side) -> tuple[_Node, _Node, Float[Array, " n"]]:
     return last, nodes, passed
 
 
-def _both_sides(beam: Beam, ring_load=None) -> _Side:
+def both_sides(beam: Beam, ring_load=None) -> Side:
     """The beam read from A and from B, stacked on a leading axis."""
 
     def both(v):
@@ -104,7 +104,7 @@ def _both_sides(beam: Beam, ring_load=None) -> _Side:
     h = both(jnp.diff(_ends(beam)))
     GA = None if beam.GA is None else both(beam.GA)
     load = None if ring_load is None else both(ring_load)
-    return _Side(h, both(beam.EI), GA, both(beam.k), load)
+    return Side(h, both(beam.EI), GA, both(beam.k), load)
 
 
 def _ends(beam: Beam):
@@ -140,7 +140,7 @@ def _reach(
     return jnp.stack([count, n - count]), last, jnp.stack([s_c, beam.length - s_c])
 
 
-def _up_to(side: _Side, count, last) -> _Side:
+def _up_to(side: Side, count, last) -> Side:
     """The side cut off at C: the span that holds C shortened, everything beyond it zero."""
     order = jnp.arange(side.h.shape[0])
     h = jnp.where(order == count, last, jnp.where(order < count, side.h, 0))
@@ -149,7 +149,7 @@ def _up_to(side: _Side, count, last) -> _Side:
     return side._replace(h=h, k=jnp.where(held, side.k, 0), load=load)
 
 
-def _tip(side: _Side, node: _Node) -> _Node:
+def _tip(side: Side, node: _Node) -> _Node:
     """Add the last span."""
     return _add_span(node, side.h[-1], side.EI[-1], None if side.GA is None else side.GA[-1])
 
@@ -210,15 +210,15 @@ def contact_compliance(
 @functools.partial(jax.jit, static_argnames="split", inline=True)
 def _contact_compliance(beam: Beam, s_c: Float[Array, "*m"], split: Split) -> Float[Array, "*m"]:
     """`contact_compliance`, of arguments that are checked."""
-    both = _both_sides(beam)
+    both = both_sides(beam)
     on = (s_c >= 0) & (s_c <= beam.length)
     s_c = jnp.where(on, s_c, beam.length / 2)
     if s_c.ndim == 0:
         count, last, s = _reach(beam, s_c)
         cut = jax.vmap(_up_to)(both, count, last)
-        tips = jax.vmap(lambda side: _tip(side, _sweep(side)[0]))(cut)
+        tips = jax.vmap(lambda side: _tip(side, sweep(side)[0]))(cut)
         return jnp.where(on, _compliance_at(tips.g, s, split), jnp.nan)
-    _, nodes, _ = jax.vmap(_sweep)(both)
+    _, nodes, _ = jax.vmap(sweep)(both)
 
     def with_clamp(v):
         return jnp.concatenate([jnp.zeros_like(v[:, :1]), v], axis=1)
@@ -308,8 +308,8 @@ def deflect_on(
     if form == "reactions":
         return deflect_dense(beam, s_c, force, split=split)
     count, last, s = _reach(beam, s_c)
-    cut = jax.vmap(_up_to)(_both_sides(beam, ring_load), count, last)
-    end, nodes, passed = jax.vmap(_sweep)(cut)
+    cut = jax.vmap(_up_to)(both_sides(beam, ring_load), count, last)
+    end, nodes, passed = jax.vmap(sweep)(cut)
     tips = jax.vmap(_tip)(cut, end)
     w_C, theta_C, V, M = divide_load(tips.g, s, force, split, tips.free)
     w, theta, R = jax.vmap(_back_substitute)(cut, nodes, passed, V, M)
@@ -321,7 +321,7 @@ def deflect_on(
     return Deflection(w_C, theta_C, both(w, 1), both(theta, -1), both(R, 1), V[0], M[0])
 
 
-def _back_substitute(side: _Side, nodes: _Node, passed, V, M):
+def _back_substitute(side: Side, nodes: _Node, passed, V, M):
     """From the load (V, M) at the tip back to the clamp: w, theta and R at every support."""
 
     def step(tip, ring):

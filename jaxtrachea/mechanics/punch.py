@@ -20,6 +20,7 @@ from jaxtrachea._numerics import epsilon, picked, product
 from jaxtrachea.mechanics.beam import deflect_on
 from jaxtrachea.mechanics.compliance import Beam
 from jaxtrachea.mechanics.force_law import on_one_ring
+from jaxtrachea.mechanics.marks import with_marks, without_marks
 
 #: Points of Gauss and Legendre in [-1, 1] and their weights, for means over the width.
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -62,7 +63,7 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
         half_width: mm, more than 0.
     """
     ends = jnp.clip(jnp.stack([s_c - half_width, s_c + half_width]), 0, beam.length)
-    marked, passed, marks = _with_marks(beam, ends)
+    marked, passed, marks = with_marks(beam, ends)
     unit = jax.vmap(lambda s: deflect_on(marked, s, jnp.ones_like(s)))(ends)
     c_11, c_22 = unit.w_C
     c_12 = unit.w[0, marks[1]]
@@ -74,7 +75,7 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
 
     def add(found, end):
         share, moved = end
-        own = jax.tree.map(lambda v: share * _without_marks(v, passed), moved)
+        own = jax.tree.map(lambda v: share * without_marks(v, passed, 2), moved)
         return jax.tree.map(jnp.add, found, own), None
 
     # A loop: of a sum XLA for CPUs makes a part of what reads it, and computes it anew for each
@@ -86,39 +87,6 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     return UnitDeflection(
         c_12 + share[0] * second, product(share, edges), w, theta, reaction, edges
     )
-
-
-def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
-    """The beam with two more supports, the marks, of no stiffness.
-
-    A mark at a support stands behind it.
-
-    Returns:
-        That beam, how many marks stand before each support of `beam`, and the places of the marks.
-    """
-    n = beam.x.shape[0]
-    passed = jnp.sum(ends[None] < beam.x[:, None], axis=1)
-    mark = jnp.sum(beam.x[None] <= ends[:, None], axis=1) + jnp.arange(2)
-    place = jnp.arange(n + 3)  # of a support, and of the span before it
-    before = jnp.sum(mark[None] < place[:, None], axis=1)
-
-    def spread(v, before):
-        """Each as far behind as marks stand before it; no gather, which goes back as a scatter."""
-        shifts = [jnp.pad(v, (i, 2 - i)) for i in range(3)]
-        return jnp.where(before == 0, shifts[0], jnp.where(before == 1, shifts[1], shifts[2]))
-
-    first, second = (place[:-1] == at for at in mark)
-    x, k = (spread(v, before[:-1]) for v in (beam.x, beam.k))
-    x = jnp.where(first, ends[0], jnp.where(second, ends[1], x))
-    k = jnp.where(first | second, 0, k)
-    GA = None if beam.GA is None else spread(beam.GA, before)
-    return Beam(x, beam.length, spread(beam.EI, before), k, GA), passed, mark
-
-
-def _without_marks(v: Float[Array, " supports"], passed) -> Float[Array, " n"]:
-    """Of all supports those that are no marks."""
-    n = passed.shape[0]
-    return jnp.where(passed == 0, v[:n], jnp.where(passed == 1, v[1 : n + 1], v[2:]))
 
 
 def mean_ring_weight(

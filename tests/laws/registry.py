@@ -22,6 +22,7 @@ from jaxtrachea.mechanics.force_law import Law, duffing, ring_weight
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.mechanics.press_contacts import press_contacts
 from jaxtrachea.mechanics.skeleton import skeleton_response
 from jaxtrachea.mechanics.vector_equilibrium import press_vector
 from jaxtrachea.trachea.geometry import Geometry
@@ -101,6 +102,14 @@ def pressed(**options):
     return call
 
 
+def several(**options):
+    def call(v):
+        found = press_contacts(_tube(v), _material(v), v["s"], v["D"], Options(**options))
+        return found.force, found.depth, found.skeleton, found.joints, found.compliance
+
+    return call
+
+
 def _oblique(v):
     found = press_oblique(_tube(v), _material(v), v["s"], v["phi"], v["D"])
     return found.force, found.depth, found.joints
@@ -134,6 +143,10 @@ SAYS = r"Material.EI_L has 7 values; .* 6 values"
 
 PRESS = TUBE | VALUES | {"s": 26.7, "D": np.array([0.3, 1.1, 2.5])}
 OBLIQUE = TUBE | VALUES | RING | {"s": 26.7, "phi": 0.3, "D": np.array([0.1, -1.1, -0.2])}
+#: The third is lifted off in the second row.
+CONTACTS = PRESS | {
+    "s": np.array([26.7, 44.0, 20.0]), "D": np.array([[0.3, 1.1, 2.5], [2.5, 0.6, 0.1]]),
+}  # fmt: skip
 SOFT = {"k_3": -1e4}
 OFF = {"s": 400.0}
 
@@ -183,6 +196,15 @@ ROWS = {
     "press, softening": Row(
         pressed(skeleton="softening"), PRESS | {"e_1": 0.1, "e_2": 0.002}, {"k_1": np.inf}, (),
     ),
+    "press_contacts": Row(
+        several(), CONTACTS, {"s": np.array([26.7, 400.0, 20.0])},
+        (changed(several(), r"displacement has 2 values; expected shape", D=np.ones(2)),),
+    ),
+    "press_contacts, two materials": Row(
+        several(contact="bonded", local="two-material", shear=True, half_width=2.0),
+        CONTACTS | {"GA_L": 1.3, "k_1_ring": 0.9, "s": np.array([26.7, 44.7, 18.3])},
+        {"k_M": -0.1}, (),
+    ),
     "press_oblique": Row(
         _oblique, OBLIQUE, OFF,
         (changed(_oblique, SAYS, **LONG),),
@@ -201,5 +223,11 @@ ROWS = {
     ),
 }  # fmt: skip
 #: Long to compile, of a kind that another row is of too.
-SLOW = ("press_path", "skeleton_response", "press, softening", "press, two materials")
+SLOW = (
+    "press_path",
+    "press_contacts, two materials",
+    "skeleton_response",
+    "press, softening",
+    "press, two materials",
+)
 EACH = [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in ROWS]

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.compiling
 STEP = 1e-3  # relative; the five-point rule is then exact to 1e-11
 each = pytest.mark.parametrize("name", EACH)
 #: Jacobians of whole presses take ten seconds each to compile, those of a distance as well.
-LONG = {*SLOW, "press", "press_oblique", "signed_distance"}
+LONG = {*SLOW, "press", "press_contacts", "press_oblique", "signed_distance"}
 DIFFERENTIATED = [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in ROWS]
 
 
