@@ -97,7 +97,7 @@ def draw_surface(
     length = figure.add_axes((0.70, 0.12, 0.28, 0.28))
     wall = Triangles(vertices, near)
     outline = _print(scene, path, row, wall)
-    _draw_view(view, scene, wall, rest, tool, contact, moved / top, rings, outline)
+    _draw_view(view, wall, rest, tool, contact, moved / top, rings, outline)
     if out.joints is not None:
         _draw_joints(view, scene, mesh, vertices, contact, span)
     _draw_across(across, Triangles(vertices, near), rest, tool, contact)
@@ -212,7 +212,7 @@ def _shade(triangles: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.nd
     return 0.5 + 0.5 * np.clip(np.abs(normal @ light), 0, 1), normal[:, 2] > 0
 
 
-def _draw_view(axis: Any, scene, wall, rest, tool, contact, share, rings, outline) -> None:
+def _draw_view(axis: Any, wall, rest, tool, contact, share, rings, outline) -> None:
     """The tube, its tool and the force, projected."""
     camera = _camera(contact)
     seen = wall.vertices @ camera.T
@@ -239,11 +239,11 @@ def _draw_view(axis: Any, scene, wall, rest, tool, contact, share, rings, outlin
     )
     turned = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     edge = crossings(wall.faces[turned[:, 2] > 0], rings).at(seen)
-    axis.add_collection(LineCollection(edge[:, :, :2], colors=RING, linewidths=0.7))
+    axis.add_collection(LineCollection(list(edge[:, :, :2]), colors=RING, linewidths=0.7))
     _draw_rest(axis, rest @ camera.T, wall.faces, share)
     if outline is not None:
         print_ = outline @ camera.T
-        axis.add_collection(LineCollection(print_[:, :, :2], colors="k", linewidths=1.1))
+        axis.add_collection(LineCollection(list(print_[:, :, :2]), colors="k", linewidths=1.1))
     low, high = triangles.reshape(-1, 3).min(axis=0)[:2], triangles.reshape(-1, 3).max(axis=0)[:2]
     if tool is not None:
         points = (tool.vertices @ camera.T)[:, :2]
@@ -263,7 +263,7 @@ def _draw_rest(axis: Any, seen: np.ndarray, faces: np.ndarray, share: np.ndarray
     front = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] > 0
     edges = np.unique(np.sort(faces[front][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     axis.add_collection(
-        LineCollection(seen[edges][:, :, :2], colors=REST, linewidths=0.35, alpha=0.45)
+        LineCollection(list(seen[edges][:, :, :2]), colors=REST, linewidths=0.35, alpha=0.45)
     )
 
 
@@ -344,7 +344,7 @@ def _draw_length(axis: Any, wall: Triangles, rest, tool, contact: Contact, along
     point = contact.centre - contact.s * axes[:, 0]
     found, ends = _lines(axis, wall, rest, tool, point, contact.axes[:, 2], axes)
     on = found.at(rings).mean(axis=1) > 0
-    axis.add_collection(LineCollection(ends[on], colors=RING, linewidths=3.2, zorder=2.5))
+    axis.add_collection(LineCollection(list(ends[on]), colors=RING, linewidths=3.2, zorder=2.5))
     tip, force = (contact.tip - point) @ axes, contact.force @ axes
     _flat_force(axis, tip, force, contact)
     axis.set(aspect="equal", xlabel="s [mm], carina to larynx", ylabel="to the contact [mm]")
@@ -364,12 +364,12 @@ def _frame(axis: Any) -> None:
 def _lines(axis: Any, wall: Triangles, rest, tool, point, normal, axes):
     """Wall, wall at rest and tool, cut by a plane; the wall's crossings and their ends."""
     _, still = _section(Triangles(rest, wall.faces), point, normal, axes)
-    axis.add_collection(LineCollection(still, colors=REST, linewidths=0.9, linestyles="--"))
+    axis.add_collection(LineCollection(list(still), colors=REST, linewidths=0.9, linestyles="--"))
     found, ends = _section(wall, point, normal, axes)
-    axis.add_collection(LineCollection(ends, colors="k", linewidths=1.3, zorder=2))
+    axis.add_collection(LineCollection(list(ends), colors="k", linewidths=1.3, zorder=2))
     if tool is not None:
         _, cut = _section(tool, point, normal, axes)
-        axis.add_collection(LineCollection(cut, colors=TOOL, linewidths=1.4, zorder=3))
+        axis.add_collection(LineCollection(list(cut), colors=TOOL, linewidths=1.4, zorder=3))
     return found, ends
 
 
