@@ -235,7 +235,7 @@ def _draw_view(axis: Any, wall, rest, tool, contact, share, rings, outline) -> N
     corners, faced = corners[order], faced[order]
     edges = np.where(faced[:, 3:] == 1, faced, 0)
     axis.add_collection(
-        PolyCollection(corners[:, :, :2], facecolors=faced, edgecolors=edges, linewidths=0.3)
+        PolyCollection(list(corners[:, :, :2]), facecolors=faced, edgecolors=edges, linewidths=0.3)
     )
     turned = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     edge = crossings(wall.faces[turned[:, 2] > 0], rings).at(seen)
