@@ -59,7 +59,8 @@ WITHIN = {
         {"step"},
         {"session"},
         {"build", "results"},
-        {"cost", "plots"},
+        {"cost", "plots", "solids"},
+        {"surface_plot"},
     ],
     "measurements": [
         {"presses", "turning", "plausible", "first_touch", "observed", "press_shape"},

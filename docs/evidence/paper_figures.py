@@ -14,9 +14,9 @@ import numpy as np
 from jaxtrachea.mechanics.oblique import ObliqueOptions, ObliquePress, press_oblique
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene.build import stage
-from jaxtrachea.scene.plots import draw_surface
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.scene.surface_plot import draw_surface
 from jaxtrachea.trachea.geometry import TABLE_1, disc_second_moment, table_1
 from jaxtrachea.trachea.material import Material
 
@@ -114,19 +114,18 @@ def draw() -> None:
 
 
 def pressed(name: str):
-    """The scene configs/NAME.toml and the vertices of its last row."""
+    """The scene configs/NAME.toml, its path and its simulation."""
     spec = load_scene_spec(HERE.parents[1] / "configs" / f"{name}.toml")
     scene, material, path, _, _ = stage(spec, HERE)
     out = jax.jit(simulate)(scene, material, path)
-    assert out.vertices is not None
-    return spec.title, scene, np.asarray(out.vertices[-1])
+    return spec.title, scene, path, out
 
 
 def draw_surfaces() -> None:
     """Figure 6."""
     for letter, name in zip("abc", ("normal", "left_down", "right_down"), strict=True):
-        title, scene, vertices = pressed(name)
-        figure = draw_surface(scene, vertices, title)
+        title, scene, path, out = pressed(name)
+        figure = draw_surface(scene, path, out, len(out.s) - 1, title)
         figure.savefig(HERE / "figures" / f"fig_6{letter}.png", dpi=90)
 
 

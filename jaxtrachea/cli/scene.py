@@ -85,12 +85,12 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
         if spec.output.surface:
             load_beside("trimesh")
         if spec.output.pictures:
-            load_beside("jaxtrachea.scene.plots")
+            load_beside("jaxtrachea.scene.surface_plot")
         out = jax.block_until_ready(Traced(run)(staged.scene, staged.material, staged.path))
         clock.append(time.perf_counter())
         stop_if_asked()
         title = spec.title or scene.stem
-        with beside(_draw, folder, title, spec.output.pictures, staged.scene, out) as drawing:
+        with beside(_draw, folder, title, spec.output.pictures, staged, out) as drawing:
             write_meshes(folder, staged.scene, out)
             write_forces(folder / "forces.csv", out)
             made = _provenance(scene, staged, clock)
@@ -279,20 +279,20 @@ def _rows(staged) -> int:
     return len(path.s if isinstance(path, Presses) else path.translation)
 
 
-def _draw(folder: Path, title: str, pictures: bool, scene, out) -> dict[str, str]:
+def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, str]:
     """Draw what is asked for; why a picture could not be drawn, by file name."""
     if not pictures:
         return {}
-    import numpy as np
-
     from jaxtrachea.files.pictures import save_each
-    from jaxtrachea.scene.plots import draw_series, draw_surface
+    from jaxtrachea.scene.plots import draw_series
     from jaxtrachea.scene.results import last_solved
+    from jaxtrachea.scene.surface_plot import draw_surface
 
-    drawings = {"series.png": partial(draw_series, out)}
+    shown = staged.scene, staged.path, out
+    drawings = {"series.png": partial(draw_series, *shown)}
     row = last_solved(out)
     if out.vertices is not None and row is not None:
-        drawings["surface.png"] = partial(draw_surface, scene, np.asarray(out.vertices[row]), title)
+        drawings["surface.png"] = partial(draw_surface, *shown, row, title)
     return save_each(folder, drawings)[1]
 
 

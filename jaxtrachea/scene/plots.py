@@ -1,80 +1,116 @@
 """Pictures of simulations and sweeps (matplotlib without a global backend)."""
 
-import textwrap
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from jaxtrachea.files.pictures import plain
 from jaxtrachea.scene.simulation import Simulation
-from jaxtrachea.scene.stage import Scene
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.scene.sweep import Sweep
+from jaxtrachea.status import PressStatus
 
-#: Unit vector towards the light, over the viewer's shoulder.
-LIGHT = np.array([0.25, -0.55, 0.8]) / np.sqrt(0.25**2 + 0.55**2 + 0.8**2)
+#: Statuses with a force, how each is marked, and what the mark is called.
+MARKS = {
+    PressStatus.OK: ("o", "#1b5e9b", "#1b5e9b"),
+    PressStatus.NO_CONTACT: ("o", "w", "0.55"),
+}
+WARNED = ("^", "#e69f00", "#a05f00")
+UNSOLVED = ("x", "#b4001e", "#b4001e")
 
 
-def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: float = 45.0) -> Figure:
-    """The deformed surface round the largest motion, coloured by it, in the manner of Fig. 6.
+def draw_series(scene: Scene, path: Poses | Presses, out: Simulation) -> Figure:
+    """Normal force, force along the surface with the limit of friction, and motion of the wall.
+
+    All are drawn along the way of the tool. A row without a solution is a cross on the axis.
 
     Args:
-        scene: with a mesh.
-        vertices: deformed, mm.
-        title: of the picture.
-        span: length of tube shown to each side, mm.
+        scene: its friction is read.
+        path: of the simulation.
+        out: the simulation.
     """
-    assert scene.mesh is not None
-    rest, faces = np.asarray(scene.mesh.vertices, float), np.asarray(scene.mesh.faces)
-    moved = np.linalg.norm(vertices - rest, axis=1)
-    middle = rest[np.argmax(moved)]
-    keep = (np.abs(rest[faces][:, :, 0] - middle[0]) < span).all(axis=1)
-    # x to the right, z towards the viewer, y up: turned, not mirrored.
-    corners = vertices[faces[keep]][:, :, [0, 2, 1]] * [1, -1, 1]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    light = 0.3 + 0.7 * np.clip(normals @ LIGHT, 0, 1)
-    figure = Figure(figsize=(6, 3), dpi=110)
-    axis: Any = figure.add_subplot(projection="3d")
-    size = moved[faces[keep]].mean(axis=1)
-    top = max(float(moved.max()), 1e-9)
-    colour = colormaps["viridis"](size / top)
-    colour[:, :3] *= light[:, None]
-    wall = Poly3DCollection(corners, facecolors=colour, edgecolors=colour, linewidths=0.2)
-    wall.set_clip_on(False)  # the axes are a square in the middle of the picture
-    axis.add_collection3d(wall)
-    low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axis.set_box_aspect(high - low, zoom=1.8)
-    axis.view_init(elev=24, azim=-72)
-    axis.set_axis_off()
-    axis.set_position((0, 0, 0.86, 0.95))
-    scale = ScalarMappable(Normalize(0, top), "viridis")
-    figure.colorbar(scale, cax=figure.add_axes((0.88, 0.2, 0.02, 0.6)), label="displacement [mm]")
-    lines = [plain(line, 56) for line in textwrap.wrap(title, 55)[:3]]
-    figure.text(0.43, 0.93, "\n".join(lines), ha="center", fontsize=10)
+    way, label = _way(path, out)
+    status = np.asarray(out.status)
+    phi = np.asarray(out.phi, float)
+    inward = np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], axis=1)
+    round_ = np.stack([0 * phi, -np.sin(phi), np.cos(phi)], axis=1)
+    force, depth, skeleton = (np.asarray(v, float) for v in (out.force, out.depth, out.skeleton))
+    figure = Figure(figsize=(9.6, 2.9), dpi=110, layout="constrained")
+    normal, aside, motion = figure.subplots(1, 3)
+    parts = [np.sum(v * inward, axis=1) for v in (force, depth, skeleton)]
+    _draw_parts(normal, way, {"": parts[0]}, "0.35")
+    _draw_status(normal, way, parts[0], status)
+    normal.set(xlabel=label, ylabel="normal force [N]")
+    tangential = {"along the tube": force[:, 0], "around it": np.sum(force * round_, axis=1)}
+    _draw_parts(aside, way, tangential)
+    if scene.friction is not None and scene.plan.friction:
+        size = np.linalg.norm(force - parts[0][:, None] * inward, axis=1)
+        aside.plot(way, size, color="k", lw=0.8, label="size of both")
+        aside.plot(
+            way, float(scene.friction) * parts[0], color="#b4001e", ls="--", lw=1.1,
+            label=f"limit: {float(scene.friction):.3g} x normal",
+        )  # fmt: skip
+    aside.set(xlabel=label, ylabel="force along the surface [N]")
+    aside.set_xlim(normal.get_xlim())
+    if not np.isfinite(aside.dataLim.intervaly).all() or not aside.dataLim.height > 0:
+        aside.set(ylim=(-1, 1), yticks=[0])
+    _draw_parts(motion, way, {"indentation": parts[1], "skeleton": parts[2]})
+    motion.set(xlabel=label, ylabel="motion inwards [mm]")
+    for axis in (normal, aside, motion):
+        axis.margins(y=0.08)
+        low, high = axis.get_ylim()
+        axis.set_ylim(low, high + 0.3 * (high - low))  # room for the legend
+        axis.legend(frameon=False, fontsize=7, loc="upper left")
+        axis.grid(alpha=0.25)
     return figure
 
 
-def draw_series(out: Simulation) -> Figure:
-    """Force and motions along the path."""
-    figure = Figure(figsize=(7, 2.6), dpi=110)
-    left, right = figure.subplots(1, 2)
-    rows = np.arange(1, len(out.s) + 1)
-    for i, name in enumerate("xyz"):
-        left.plot(rows, np.asarray(out.force)[:, i], ".-", lw=0.8, label=name)
-        right.plot(rows, np.asarray(out.skeleton)[:, i], ".-", lw=0.8, label=name)
-    left.set(xlabel="row", ylabel="force on the tube [N]")
-    right.set(xlabel="row", ylabel="skeleton at the contact [mm]")
-    left.legend(frameon=False, fontsize=7)
-    figure.tight_layout()
-    return figure
+def _way(path: Poses | Presses, out: Simulation) -> tuple[np.ndarray, str]:
+    """What rows are drawn along, mm, and its name."""
+    if isinstance(path, Presses):
+        size = np.linalg.norm(np.asarray(path.displacement, float), axis=1)
+        return size, "displacement of the tool [mm]"
+    place = np.asarray(path.translation, float)
+    steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    gap = np.nan_to_num(np.asarray(out.gap, float), nan=np.inf)
+    inside = np.flatnonzero(gap <= 0)
+    if not len(inside):
+        return way, "way of the tool [mm]"
+    first = int(inside[0])
+    share = 0.0
+    if first > 0 and np.isfinite(gap[first - 1]):
+        share = gap[first] / (gap[first] - gap[first - 1])
+    touch = way[first] - share * (way[first] - way[first - 1 if first else 0])
+    return way - touch, "way of the tool from first touch [mm]"
+
+
+def _draw_parts(axis: Any, way: np.ndarray, parts: dict[str, np.ndarray], colour=None) -> None:
+    """A line each; what is zero throughout is named in the legend and not drawn."""
+    largest = max(float(np.nanmax(np.abs(v), initial=0)) for v in parts.values())
+    looks = (("#1b5e9b", "-", "."), ("#e69f00", "--", "s"))
+    for (name, value), (own, style, mark) in zip(parts.items(), looks, strict=False):
+        if not np.nanmax(np.abs(value), initial=0) > 1e-9 * max(largest, 1e-9):
+            axis.plot([], [], color=own, ls=style, label=f"{name}: zero" if name else "zero")
+            continue
+        shown = "" if colour else mark
+        axis.plot(way, value, color=colour or own, ls=style, marker=shown, ms=3, lw=1, label=name)
+
+
+def _draw_status(axis: Any, way: np.ndarray, force: np.ndarray, status: np.ndarray) -> None:
+    """A mark for every row by its status, named in the legend."""
+    for code in np.unique(status):
+        which = PressStatus(int(code))
+        solved = status == code
+        mark, face, edge = MARKS.get(which, WARNED if which.solved else UNSOLVED)
+        height = force[solved] if which.solved else np.zeros(solved.sum())
+        axis.scatter(
+            way[solved], np.nan_to_num(height), marker=mark, s=16, linewidths=0.9,
+            zorder=3, label=f"{which.name.lower().replace('_', ' ')} ({solved.sum()} rows)",
+            **({"color": edge} if mark == "x" else {"facecolors": face, "edgecolors": edge}),
+        )  # fmt: skip
 
 
 def draw_map(s, phi, values: np.ndarray, label: str) -> Figure:
@@ -88,7 +124,7 @@ def draw_map(s, phi, values: np.ndarray, label: str) -> Figure:
     """
     figure = Figure(figsize=(7, 2.8), dpi=110)
     axis = figure.subplots()
-    image = axis.pcolormesh(s, np.degrees(phi), values.T, shading="nearest")
+    image = axis.pcolormesh(s, np.degrees(phi), values.T, shading="nearest", cmap="cividis")
     axis.set(xlabel="s [mm], carina to larynx", ylabel="phi [deg]")
     figure.colorbar(image, ax=axis, label=label)
     figure.tight_layout()

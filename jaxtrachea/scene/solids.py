@@ -1,0 +1,130 @@
+"""Triangles of a tool, its distance from points, and lines where a surface crosses a level.
+
+For pictures and mesh files: numpy, no derivative. Lengths in mm.
+"""
+
+import contextlib
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxtrachea.contact.shapes import Shape
+
+#: Directions on the sphere: a ball of 5 mm is drawn within 0.03 mm.
+DIRECTIONS = 600
+
+
+class Triangles(NamedTuple):
+    """A triangle mesh.
+
+    Attributes:
+        vertices: mm; shape (vertices, 3).
+        faces: three vertices each, counter-clockwise seen from outside; shape (faces, 3).
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+
+
+class Crossings(NamedTuple):
+    """Segments on the edges of triangles; a value per vertex is interpolated by `at`.
+
+    Attributes:
+        start: first vertex of the edge at both ends of each segment; shape (segments, 2).
+        stop: second vertex of that edge.
+        share: place on the edge, 0 at the first vertex, 1 at the second.
+    """
+
+    start: Int[np.ndarray, "segments 2"]
+    stop: Int[np.ndarray, "segments 2"]
+    share: Float[np.ndarray, "segments 2"]
+
+    def at(self, values: np.ndarray) -> np.ndarray:
+        """Values at both ends of every segment; shape (segments, 2, ...).
+
+        Args:
+            values: of every vertex; shape (vertices, ...).
+        """
+        share = self.share.reshape(self.share.shape + (1,) * (values.ndim - 1))
+        return (1 - share) * values[self.start] + share * values[self.stop]
+
+
+def sphere_directions(count: int = DIRECTIONS) -> Float[np.ndarray, "count 3"]:
+    """Unit vectors spread evenly by the golden angle."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+
+
+def tool_triangles(shape: Shape, count: int = DIRECTIONS) -> Triangles:
+    """The surface of a convex tool about its own origin.
+
+    It is the hull of the support points in `count` directions, so it lies inside the tool by at
+    most 1 - cos of half the angle between directions, times the radius.
+
+    Args:
+        shape: a tool with a volume.
+        count: directions.
+
+    Raises:
+        scipy.spatial.QhullError: the tool is a point, a line or a plate without a radius.
+    """
+    from scipy.spatial import ConvexHull
+
+    corners, radius = np.asarray(shape.vertices, float).T, float(shape.radius)
+    points = corners
+    if radius > 0:
+        ways = sphere_directions(count)
+        points = corners[np.argmax(ways @ corners.T, axis=1)] + radius * ways
+    hull = ConvexHull(points)
+    used, faces = np.unique(hull.simplices, return_inverse=True)
+    vertices, faces = points[used], faces.reshape(hull.simplices.shape)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    inward = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return Triangles(vertices, faces)
+
+
+def tool_distance(shape: Shape, points: np.ndarray, count: int = 4000) -> np.ndarray:
+    """Signed distance of points from a convex tool about its own origin, mm; negative inside.
+
+    It is the largest of d . x - h(d) over directions d, with the support function h: the normals of
+    the faces and `count` others. The error is below a hundredth of the tool's size.
+
+    Args:
+        shape: the tool.
+        points: in its frame; shape (points, 3).
+        count: directions.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    ways, corners = sphere_directions(count), np.asarray(shape.vertices, float)
+    with contextlib.suppress(QhullError, ValueError):  # a ball, a capsule or a plate has no faces
+        ways = np.concatenate([ways, ConvexHull(corners.T).equations[:, :3]])
+    reach = (ways @ corners).max(axis=1) + float(shape.radius)
+    return np.max(points @ ways.T - reach, axis=1)
+
+
+def crossings(faces: np.ndarray, values: np.ndarray, level: float = 0.0) -> Crossings:
+    """Where a linear function on triangles takes a value: a plane's section, an outline.
+
+    Args:
+        faces: shape (faces, 3).
+        values: of every vertex; shape (vertices,). Triangles with NaN give nothing.
+        level: the value sought.
+    """
+    above = values > level
+    count = above[faces].sum(axis=1)
+    mixed = (count == 1) | (count == 2)
+    mixed &= np.isfinite(values[faces]).all(axis=1)
+    corners = faces[mixed]
+    lone = above[corners] == (count[mixed] == 1)[:, None]  # the corner that is alone on its side
+    first = np.argmax(lone, axis=1)
+    rows = np.arange(len(corners))
+    start = corners[rows, first]
+    stop = np.stack([corners[rows, (first + 1) % 3], corners[rows, (first + 2) % 3]], axis=1)
+    begin = values[start][:, None]
+    share = (level - begin) / (values[stop] - begin)
+    return Crossings(np.repeat(start[:, None], 2, axis=1), stop, share)
