@@ -1,0 +1,199 @@
+"""Bytes between the model and the page: one packet for the scene, one frame for every step.
+
+Packet: length of a JSON text (uint32), the text, then the arrays that its `arrays` names, each from
+a multiple of four bytes on. Frame: ten float32 (`Head`), then the positions of all vertices
+(float32, mm); no positions where the step has no solution. No number of either is NaN.
+"""
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.scene.simulation import Simulation
+from jaxtrachea.scene.stage import Scene
+from jaxtrachea.status import PressStatus
+
+#: Largest coordinate of a tool that is taken from a page, mm.
+FARTHEST = 1e4
+#: Longest message that a page may send, bytes.
+LONGEST = 4096
+HEAD_BYTES = 40
+
+
+class Frame(NamedTuple):
+    """What one step shows.
+
+    Attributes:
+        status: of the step.
+        pose: rotation by rows, then the translation, mm; shape (12,).
+        force: on the tube in the frame of the mesh, N; shape (3,). Zeros: no solution.
+        depth: of the tool below the wall at rest, mm, not negative.
+        point: of the contact on the tool, mm; shape (3,).
+        seconds: that the step took.
+        vertices: of the wall, mm, float32; shape (vertices, 3). None: no solution.
+    """
+
+    status: PressStatus
+    pose: Float[np.ndarray, "12"]
+    force: Float[np.ndarray, "3"]
+    depth: float
+    point: Float[np.ndarray, "3"]
+    seconds: float
+    vertices: np.ndarray | None
+
+    @property
+    def has_force(self) -> bool:
+        """Whether there is a force to show: the step is solved, and the tool touches."""
+        return self.vertices is not None and self.status != PressStatus.NO_CONTACT
+
+    def pack(self) -> bytes:
+        """As bytes; see the module."""
+        vertices = b"" if self.vertices is None else np.ascontiguousarray(self.vertices).tobytes()
+        return self.head.tobytes() + vertices
+
+    @property
+    def head(self) -> np.ndarray:
+        """Status, vertices, force (3), depth, point (3), milliseconds; float32."""
+        count = 0 if self.vertices is None else len(self.vertices)
+        values = [self.status, count, *self.force, self.depth, *self.point, 1e3 * self.seconds]
+        return np.array(values, np.float32)
+
+
+def frame_of(scene: Scene, pose: np.ndarray, result: Simulation, seconds: float) -> Frame:
+    """A step as it is shown; without positions where a number of it is not finite."""
+    status = PressStatus(int(result.status))
+    turn = np.eye(3) if result.frame is None else np.asarray(result.frame, float)
+    force = turn @ np.asarray(result.force, float)
+    depth = 0.0 if result.gap is None else max(-float(result.gap), 0.0)
+    inward = -turn @ np.array([0.0, np.cos(float(result.phi)), np.sin(float(result.phi))])
+    vertices = np.asarray(result.vertices, np.float32)
+    numbers = (force, depth, inward, vertices)
+    if not status.solved or not all(np.isfinite(v).all() for v in numbers):
+        return Frame(status, pose, np.zeros(3), 0.0, np.zeros(3), seconds, None)
+    assert scene.tool is not None
+    point = pose[9:] + foremost(scene.tool, pose[:9].reshape(3, 3), inward)
+    return Frame(status, pose, force, depth, point, seconds, vertices)
+
+
+def foremost(tool: Shape, rotation: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """The point of a turned tool that lies farthest along a unit vector, from its origin, mm."""
+    corners = (rotation @ np.asarray(tool.vertices, float)).T
+    along = corners @ direction
+    return corners[along > along.max() - 1e-3].mean(axis=0) + float(tool.radius) * direction
+
+
+def packet(text: dict, arrays: dict[str, np.ndarray]) -> bytes:
+    """A text and named arrays as bytes; see the module."""
+    parts, listed, start = [], [], 0
+    for name, array in arrays.items():
+        data = np.ascontiguousarray(array).tobytes()
+        listed.append([name, array.dtype.name, start, array.size])
+        parts.append(data.ljust(-(-len(data) // 4) * 4, b"\0"))
+        start += len(parts[-1])
+    head = json.dumps(text | {"arrays": listed}, allow_nan=False).encode()
+    head = head.ljust(-(-len(head) // 4) * 4)
+    return np.uint32(len(head)).tobytes() + head + b"".join(parts)
+
+
+def tube_arrays(vertices, faces, ring: np.ndarray, midline: np.ndarray, tool: Shape) -> dict:
+    """Arrays of a packet: the wall at rest and the surface of the tool.
+
+    Args:
+        vertices: at rest, mm; shape (vertices, 3).
+        faces: of the wall; shape (faces, 3).
+        ring: vertices on a ring; bool, shape (vertices,).
+        midline: of each ring, the vertex on the anterior midline.
+        tool: about its origin.
+    """
+    corners, sides = tool_surface(tool)
+    return {
+        "rest": np.asarray(vertices, np.float32), "faces": np.asarray(faces, np.uint32),
+        "joints": midline.astype(np.uint32), "tool": corners.astype(np.float32),
+        "sides": sides.astype(np.uint32), "ring": ring.astype(np.uint8),
+    }  # fmt: skip
+
+
+def scene_packet(scene: Scene, title: str, pose: np.ndarray) -> bytes:
+    """What a page must know of a scene before the first frame."""
+    assert scene.mesh is not None
+    assert scene.tool is not None
+    where = rings_on(scene)
+    arrays = tube_arrays(scene.mesh.vertices, scene.mesh.faces, *where, scene.tool)
+    return packet({"title": title, "pose": pose.tolist(), "statuses": statuses()}, arrays)
+
+
+def statuses() -> dict[int, list]:
+    """Of each status its name, its sentence, and whether there is a force."""
+    return {
+        int(s): [s.name, s.message, s.solved and s != PressStatus.NO_CONTACT] for s in PressStatus
+    }
+
+
+def rings_on(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that lie on a ring (bool), and the vertex of each ring on the anterior midline."""
+    mesh, tube = scene.mesh, scene.geometry
+    assert mesh is not None
+    s, phi, distance = (np.asarray(v, float) for v in (mesh.s, mesh.phi, mesh.distance))
+    x = np.asarray(tube.ring_positions, float)
+    away = np.abs(s[:, None] - x)
+    ring = (away.min(axis=1) <= float(tube.ring_height) / 2) & (abs(phi) <= float(tube.half_angle))
+    return ring, np.hypot(away, (distance * phi)[:, None]).argmin(axis=0)
+
+
+def tool_surface(tool: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of a tool with its rounding: corners, mm, and three of them for each side."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    cores, radius = np.asarray(tool.vertices, float).T, float(tool.radius)
+    points = (cores[:, None] + radius * _directions()).reshape(-1, 3) if radius > 0 else cores
+    try:
+        found = ConvexHull(points)
+    except (QhullError, ValueError):  # flat, or too few corners: as thin as it can be seen
+        found = ConvexHull((cores[:, None] + 0.05 * _directions()).reshape(-1, 3))
+    corners, sides = found.points, found.simplices.copy()
+    a, b, c = (corners[sides[:, i]] for i in range(3))
+    inside_out = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0
+    sides[inside_out] = sides[inside_out][:, ::-1]
+    used, numbers = np.unique(sides, return_inverse=True)
+    return corners[used], numbers.reshape(sides.shape)
+
+
+def _directions() -> np.ndarray:
+    """Unit vectors spread evenly over a sphere; shape (240, 3).
+
+    Fibonacci's lattice, and both poles of each axis, so that a tool is as wide as it is.
+    """
+    i = np.arange(234) + 0.5
+    z, turn = 1 - 2 * i / 234, np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    lattice = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+    return np.concatenate([lattice, np.eye(3), -np.eye(3)])
+
+
+def read_pose(text: str) -> np.ndarray | None:
+    """A pose that a page sends, `{"pose": [12 numbers]}`; None: it acknowledges a frame.
+
+    Raises:
+        ValueError: any other text, numbers that are too large or not finite, or no rotation.
+    """
+    if len(text) > LONGEST:
+        raise ValueError("too long")
+    message = json.loads(text)
+    if message == "drawn":
+        return None
+    if not isinstance(message, dict) or set(message) != {"pose"}:
+        raise ValueError("neither a pose nor an acknowledgement")
+    numbers = message["pose"]
+    kinds = isinstance(numbers, list) and all(type(v) in (int, float) for v in numbers)
+    if not kinds or len(numbers) != 12:
+        raise ValueError("expected 12 numbers")
+    pose = np.array(numbers, float)
+    if not np.isfinite(pose).all() or abs(pose).max() > FARTHEST:
+        raise ValueError("a number is too large or not finite")
+    turn = pose[:9].reshape(3, 3)
+    if abs(turn @ turn.T - np.eye(3)).max() > 1e-9 or np.linalg.det(turn) < 0:
+        raise ValueError("no rotation")
+    return pose
