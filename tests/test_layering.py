@@ -37,7 +37,8 @@ ORDER = [
 STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}),
              ("inference", {"scene"}), ("results", {"scene"}), ("prediction", {"scene", "runs"}),
              ("runs", {"scene"}),
-             ("viewer", {"mechanics", "fitting", "inference", "results", "prediction", "report"}), ("measurements", {"contact", "mechanics", "trachea"}),
+             ("viewer", {"mechanics", "fitting", "inference", "results"}),
+             ("measurements", {"contact", "mechanics", "trachea"}),
              ("inference/analyses", {"results", "report", "scene"})]  # fmt: skip
 #: Modules within the larger rooms, from the bottom up.
 WITHIN = {

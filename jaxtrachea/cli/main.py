@@ -53,7 +53,7 @@ app = typer.Typer(
     help=(
         "Mechanics of the trachea: identify stiffnesses from force-displacement curves "
         "(check, init, fit, predict, design, compare, convert); simulate a tool on a trachea "
-        "(plan, simulate, sweep, view)."
+        "(plan, simulate, sweep, view, play)."
     ),
 )
 #: Rows of a terminal table; the files hold all.
@@ -195,7 +195,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
 
 for _command in (
     cli_compare.compare, cli_convert.convert, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
-    cli_view.view, cli_tradeoff.tradeoff, cli_selfcheck.selfcheck, cli_cache.cache,
+    cli_view.view, cli_view.play, cli_tradeoff.tradeoff, cli_selfcheck.selfcheck, cli_cache.cache,
 ):  # fmt: skip
     app.command()(_command)
 

@@ -68,6 +68,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     """Move the tool along its path: forces, deformed mesh, pictures."""
     import jax
 
+    from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.results import (
         last_solved,
@@ -79,6 +80,13 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
+    if spec.output.play:
+        from jaxtrachea.viewer.play import PlayError, of_file, three_js
+
+        try:
+            three_js()
+        except PlayError as error:
+            raise Stop(f"{scene}: output.play: {error}") from None
     staged, choice = _chosen(scene, spec, staged)
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
@@ -94,7 +102,10 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
             write_meshes(folder, staged.scene, out)
             write_forces(folder / "forces.csv", out)
             made = _provenance(scene, staged, clock)
-            write_simulation(folder / "simulation.h5", staged.scene, staged.path, out, made)
+            motion = staged.material, staged.path
+            write_simulation(folder / "simulation.h5", staged.scene, *motion, out, made)
+            if spec.output.play:
+                write_text(folder / "play.html", of_file(folder / "simulation.h5", title))
             _write_json(folder, made)
             say_lost(drawing.result())
     _print_rows(out)

@@ -43,6 +43,26 @@ def view(scene: SceneArgument, port: PortOption = None, no_browser: NoBrowser = 
     serve(scene, port, opened)
 
 
+def play(
+    simulation: Annotated[Path, typer.Argument(help="simulation.h5 of `jaxtrachea simulate`.")],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", help="HTML file; none: play.html beside it.")
+    ] = None,
+) -> None:
+    """Write a simulation as one page that plays in any browser."""
+    from jaxtrachea.files.atomic import write_text
+    from jaxtrachea.viewer.play import PlayError, of_file
+
+    path = out_file or simulation.with_name("play.html")
+    try:
+        write_text(path, of_file(simulation))
+    except PlayError as error:
+        raise Stop(str(error)) from None
+    except OSError as error:
+        raise Stop(f"{path}: cannot be written ({error.strerror}); choose another --out") from None
+    Console().print(f"written to {escape(str(path))}", highlight=False, soft_wrap=True)
+
+
 def _open(address: str) -> bool:
     """Open a browser window; False where there is no display."""
     import webbrowser

@@ -58,9 +58,9 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   world.add(new T.HemisphereLight("#ffffff", "#8a8a96", 2.2));
   const sun = new T.DirectionalLight("#ffffff", 1.6); sun.position.set(40, 120, 90); world.add(sun);
   const wall = new T.BufferGeometry();
-  const place = new T.BufferAttribute(new Float32Array(rest), 3).setUsage(T.DynamicDrawUsage);
+  const surface = new T.BufferAttribute(new Float32Array(rest), 3).setUsage(T.DynamicDrawUsage);
   const rgb = new T.BufferAttribute(new Float32Array(3 * n), 3).setUsage(T.DynamicDrawUsage);
-  wall.setAttribute("position", place); wall.setAttribute("color", rgb);
+  wall.setAttribute("position", surface); wall.setAttribute("color", rgb);
   wall.setIndex(new T.BufferAttribute(faces, 1));
   wall.computeVertexNormals();
   const outward = new Float32Array(wall.getAttribute("normal").array); // at rest
@@ -86,6 +86,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   const arrow = new T.ArrowHelper(new T.Vector3(0, 1, 0), new T.Vector3(), 10, "#c0102a", 3, 2);
   arrow.visible = false;
   world.add(mesh, ghost, tool, dots, arrow);
+  tool.visible = corners.length > 0;
   const orbit = new Orbit(camera, renderer.domElement);
   let dirty = true;
   orbit.addEventListener("change", () => { dirty = true; });
@@ -96,13 +97,17 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   const number = make("div", head, { fontSize: "24px", fontWeight: "600" }, "…");
   number.dataset.role = "force";
   const second = make("div", head, {}, ""); second.dataset.role = "detail";
-  const bar = make("canvas", el, { ...over, left: "12px", bottom: "28px", width: "180px", height: "12px" });
+  const third = make("div", head, { fontSize: "12px" }, ""); third.dataset.role = "place";
+  const legend = make("div", el, { ...over, left: "8px", bottom: "8px", width: "220px", padding: "6px",
+    background: "rgba(255,255,255,.8)", borderRadius: "4px", fontSize: "12px" });
+  const bar = make("canvas", legend, { width: "220px", height: "12px", display: "block" });
   bar.width = 256; bar.height = 1;
-  const scale = make("div", el, { ...over, left: "12px", bottom: "8px", width: "180px", display: "flex",
-    justifyContent: "space-between", fontSize: "12px" });
-  const low = make("span", scale, {}, "0"), what = make("span", scale), high = make("span", scale);
+  const scale = make("div", legend, { display: "flex", justifyContent: "space-between" });
+  make("span", scale, {}, "0");
+  const what = make("span", scale), high = make("span", scale);
   const names = [["carina", -1], ["larynx", 1]].map(([text, side]) =>
-    [make("div", el, { ...over, fontSize: "12px", color: "#555" }, text), side]);
+    [make("div", el, { ...over, fontSize: "12px",
+      background: "rgba(255,255,255,.8)", padding: "1px 4px", borderRadius: "3px" }, text), side]);
   const tools = make("div", el, { position: "absolute", right: "8px", top: "8px", display: "flex",
     flexDirection: "column", gap: "3px", font: "12px sans-serif", background: "rgba(255,255,255,.8)",
     padding: "6px", borderRadius: "4px" });
@@ -140,7 +145,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   }
 
   function paint() {
-    const v = place.array, depth = option.colour === "depth";
+    const v = surface.array, depth = option.colour === "depth";
     top = 1e-3;
     for (let i = 0; i < n; i++) {
       const a = v[3 * i] - rest[3 * i], b = v[3 * i + 1] - rest[3 * i + 1], c = v[3 * i + 2] - rest[3 * i + 2];
@@ -152,8 +157,9 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     const inside = option.print ? printed() : null;
     for (let i = 0; i < n; i++) {
       const k = 3 * Math.round(255 * Math.min(values[i] / top, 1));
-      const dim = (option.rings && ring[i] ? 1 : 0.78) * (inside && inside[i] ? 0.45 : 1);
-      for (let j = 0; j < 3; j++) rgb.array[3 * i + j] = stale ? 0.35 * dim : colours[k + j] * dim;
+      const light = option.rings && ring[i] ? 0.12 : 0, dim = inside && inside[i] ? 0.3 : 1;
+      for (let j = 0; j < 3; j++)
+        rgb.array[3 * i + j] = (light + (1 - light) * (stale ? 0.3 : colours[k + j])) * dim;
     }
     rgb.needsUpdate = true;
     const m = new T.Matrix4();
@@ -207,13 +213,14 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   // A frame: ten numbers (status, vertices, force, depth, point, ms) and positions.
   function show(h, positions) {
     const [name, message, forced] = scene.statuses[h[0]], solved = positions !== null;
-    if (solved) { place.array.set(positions); place.needsUpdate = true; }
+    if (solved) { surface.array.set(positions); surface.needsUpdate = true; }
     const f = Math.hypot(h[2], h[3], h[4]), has = solved && forced;
     last = { status: name, solved, force: has ? f : null, depth: solved ? h[5] : null };
     number.textContent = has ? `F ${f.toFixed(4)} N` : name === "NO_CONTACT" ? "no contact" : "no force";
     second.textContent = !solved || (has && name !== "OK") ? message
       : has ? `depth ${h[5].toFixed(3)} mm` : "the tool does not touch";
     if (!solved) second.textContent += " (grey: the last surface)";
+    third.textContent = tool.visible ? `tool at ${tool.position.toArray().map((v) => v.toFixed(2)).join(", ")} mm` : "";
     arrow.visible = has && f > 1e-6;
     if (arrow.visible) {
       const way = new T.Vector3(h[2], h[3], h[4]).normalize(), long = 8 + 20 * Math.min(f, 2);
@@ -305,6 +312,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     c.drawImage(gl, 0, 0); c.scale(k, k); c.fillStyle = "#1b1b1f";
     c.font = "600 24px sans-serif"; c.fillText(number.textContent, 12, 32);
     c.font = "14px sans-serif"; c.fillText(second.textContent, 12, 54);
+    c.font = "12px sans-serif"; c.fillText(third.textContent, 12, 72);
     const h = gl.clientHeight;
     c.drawImage(bar, 12, h - 40, 180, 12);
     c.font = "12px sans-serif"; c.fillText(`0 to ${high.textContent}: ${what.textContent}`, 12, h - 12);
@@ -346,13 +354,14 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   function look() {
     const p = tool.position;
     orbit.target.set(p.x, middle.y, middle.z);
-    camera.position.set(p.x - 0.7 * size, middle.y + 0.9 * size, middle.z + 1.7 * size); orbit.update(); dirty = true;
+    camera.position.set(p.x - 0.8 * size, middle.y + 1.3 * size, middle.z + 2.6 * size); orbit.update(); dirty = true;
   }
   function screen(p = tool.position) {
     const q = p.clone().project(camera), b = renderer.domElement.getBoundingClientRect();
     return [b.left + ((q.x + 1) / 2) * b.width, b.top + ((1 - q.y) / 2) * b.height];
   }
   posed(scene.pose); look(); paint(); draw();
-  return { frame, show, posed, pose, look, screen, set, stats, png, get last() { return last; },
+  function finite() { return surface.array.every(Number.isFinite); }
+  return { frame, show, posed, finite, positions: () => surface.array, deviation: scene.step, pose, look, screen, set, stats, png, get last() { return last; },
     place(x, y, z) { tool.position.set(x, y, z); moved(); }, send() { onPose(pose()); } };
 }

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.scene.session import Session
+from jaxtrachea.trachea.material import Material
 from jaxtrachea.viewer.protocol import Frame, frame_of, scene_packet
 from jaxtrachea.viewer.scene import Handled, read_handled
 from jaxtrachea.viewer.values import Slider, sliders
@@ -78,7 +79,9 @@ class Live:
         except (ValueError, OSError) as error:
             self._tell("failed", str(error))
             return
-        except Exception as error:  # a fault of the program: the page says it, the terminal shows it
+        except (
+            Exception
+        ) as error:  # a fault of the program: the page says it, the terminal shows it
             traceback.print_exc()
             self._tell("failed", f"{type(error).__name__}: {error}; the terminal shows where")
             return
@@ -126,11 +129,11 @@ class Live:
     def _prepare(self) -> Session:
         handled = read_handled(self.path, lambda text: self._tell("reading", text))
         self.handled = handled
-        scene, material = handled.staged.scene, handled.staged.material
+        scene = handled.staged.scene
         self.packet = scene_packet(scene, handled.title, self.start_pose)
         self._tell("compiling", "compiling the scene")
         session = handled.session()
-        self.sliders = sliders(material, scene.plan)
+        self.sliders = sliders(session.material, scene.plan)
         # The first step also loads what runs at the first step only.
         self.frame = self._step(session, self.start_pose)
         session.reset()
@@ -161,7 +164,7 @@ class Live:
             self.changed()
             return True
         self.frame, self.fault, self._last = frame, "", pose
-        self.steps.append(frame._replace(vertices=frame.vertices[:0] if frame.has_force else None))
+        self.steps.append(frame.light)
         del self.steps[:-MOST_STEPS]
         self._record(frame)
         self.changed()
@@ -170,6 +173,7 @@ class Live:
     def _set(self, session: Session, values: dict[str, float]) -> None:
         """Other values of the material, where they are others."""
         now = session.material
+        assert isinstance(now, Material)  # a session has no other
         new = {
             name: jnp.asarray(np.asarray(value, getattr(now, name).dtype))
             for name, value in values.items()
@@ -182,7 +186,7 @@ class Live:
         begin = time.perf_counter()
         result = session.step(pose[:9].reshape(3, 3), pose[9:])
         seconds = time.perf_counter() - begin
-        return frame_of(session.scene, pose, result, seconds)
+        return frame_of(session.scene.tool, pose, result, seconds)
 
     def _record(self, frame: Frame) -> None:
         if self.recording is None:

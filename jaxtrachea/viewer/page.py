@@ -89,7 +89,9 @@ class Page:
 
     def ready(self) -> None:
         """What there is once the scene is compiled."""
-        self.wall = Wall().style("width:calc(100vw - 420px);height:calc(100vh - 24px);min-width:480px")
+        self.wall = Wall().style(
+            "width:calc(100vw - 420px);height:calc(100vh - 24px);min-width:480px"
+        )
         self.wall.on("lost", lambda e: self.lost(e.args))
         with ui.column().style("width:376px;gap:6px"):
             ui.label(KEYS).style("font-size:12px;color:#555")
@@ -104,14 +106,18 @@ class Page:
                  "series": [{"type": "line", "showSymbol": False, "data": []}]}
             ).style("height:210px;width:370px")  # fmt: skip
             with ui.row().style("gap:6px"):
-                ui.button("clear", on_click=self.clear).props("dense no-caps size=sm")
-                ui.button("CSV", on_click=self.save_curve).props("dense no-caps size=sm")
+                ui.button("clear", on_click=self.clear).props(
+                    "dense no-caps size=sm padding='3px 8px'"
+                )
+                ui.button("CSV", on_click=self.save_curve).props(
+                    "dense no-caps size=sm padding='3px 8px'"
+                )
                 self.recorder = ui.button("record", on_click=self.record)
-                self.recorder.props("dense no-caps size=sm id=record")
+                self.recorder.props("dense no-caps size=sm padding='3px 8px' id=record")
             self.widgets = [self.slider(s) for s in self.live.sliders]
             if self.live.sliders:
                 ui.button("values as TOML", on_click=self.save_values).props(
-                    "dense no-caps size=sm id=toml"
+                    "dense no-caps size=sm padding='3px 8px' id=toml"
                 )
 
     def position(self) -> None:
@@ -119,30 +125,39 @@ class Page:
         start = self.live.start_pose[9:]
         with ui.row().style("gap:6px;align-items:center;flex-wrap:nowrap"):
             boxes = [
-                ui.number(f"{axis} [mm]", value=round(float(v), 3), format="%.3f", min=-1e3, max=1e3)
+                ui.number(f"{axis} [mm]", value=float(v), format="%.3f", min=-1e3, max=1e3)
                 .style("width:76px").props(f"dense id=place-{axis}")
                 for axis, v in zip("xyz", start, strict=True)
             ]  # fmt: skip
 
             def go() -> None:
-                if all(box.value is not None for box in boxes):
-                    self.wall.run_method("place", *(float(box.value) for box in boxes))
+                typed = [float(box.value) for box in boxes if box.value is not None]
+                if len(typed) == 3:
+                    self.wall.run_method("place", *typed)
 
-            ui.button("go", on_click=go).props("dense no-caps size=sm id=go")
-            ui.button("reset", on_click=self.reset).props("dense no-caps size=sm id=reset")
+            ui.button("go", on_click=go).props("dense no-caps size=sm padding='3px 8px' id=go")
+            ui.button("reset", on_click=self.reset).props(
+                "dense no-caps size=sm padding='3px 8px' id=reset"
+            )
 
     def slider(self, s: Slider):
         """A slider over the shares 0 to 1, with the value beside it."""
         with ui.row().style("width:100%;gap:8px;align-items:center;flex-wrap:nowrap"):
             ui.label(s.name).style("width:52px").tooltip(s.description)
-            value = ui.label(f"{s.value:.4g} {s.unit}").style("width:120px;order:3")
+            value = ui.label(f"{s.value:.4g} {s.unit}").style(
+                "width:112px;order:3;white-space:nowrap;font-size:12px"
+            )
 
             def change(share: float) -> None:
                 self.live.set_value(s.name, s.at(share))
                 value.set_text(f"{s.at(share):.4g} {s.unit}")
 
             return ui.slider(
-                min=0, max=1, step=0.002, value=s.share, on_change=lambda e: change(e.value)
+                min=0,
+                max=1,
+                step=0.002,
+                value=s.share,
+                on_change=lambda e: change(float(e.value or 0)),
             ).props(f"id=value-{s.name}")
 
     def reset(self) -> None:

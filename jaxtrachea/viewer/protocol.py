@@ -6,13 +6,13 @@ a multiple of four bytes on. Frame: ten float32 (`Head`), then the positions of 
 """
 
 import json
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.status import PressStatus
 
@@ -49,6 +49,11 @@ class Frame(NamedTuple):
         """Whether there is a force to show: the step is solved, and the tool touches."""
         return self.vertices is not None and self.status != PressStatus.NO_CONTACT
 
+    @property
+    def light(self) -> "Frame":
+        """The same without its vertices, for long lists."""
+        return self._replace(vertices=None if self.vertices is None else self.vertices[:0])
+
     def pack(self) -> bytes:
         """As bytes; see the module."""
         vertices = b"" if self.vertices is None else np.ascontiguousarray(self.vertices).tobytes()
@@ -62,19 +67,28 @@ class Frame(NamedTuple):
         return np.array(values, np.float32)
 
 
-def frame_of(scene: Scene, pose: np.ndarray, result: Simulation, seconds: float) -> Frame:
-    """A step as it is shown; without positions where a number of it is not finite."""
+def frame_of(tool: Shape | None, pose: np.ndarray, result: Any, seconds: float) -> Frame:
+    """A step as it is shown; without positions where a number of it is not finite.
+
+    Args:
+        tool: about its origin; None: the pose is that of the contact.
+        pose: see `Frame`.
+        result: one row of a `Simulation`, or what has its fields.
+        seconds: that the step took.
+    """
     status = PressStatus(int(result.status))
     turn = np.eye(3) if result.frame is None else np.asarray(result.frame, float)
     force = turn @ np.asarray(result.force, float)
-    depth = 0.0 if result.gap is None else max(-float(result.gap), 0.0)
-    inward = -turn @ np.array([0.0, np.cos(float(result.phi)), np.sin(float(result.phi))])
+    phi = float(result.phi)
+    inward = -np.array([0.0, np.cos(phi), np.sin(phi)])
+    way = inward @ np.asarray(result.displacement, float) if result.gap is None else -result.gap
+    depth, inward = max(float(way), 0.0), turn @ inward
     vertices = np.asarray(result.vertices, np.float32)
     numbers = (force, depth, inward, vertices)
     if not status.solved or not all(np.isfinite(v).all() for v in numbers):
         return Frame(status, pose, np.zeros(3), 0.0, np.zeros(3), seconds, None)
-    assert scene.tool is not None
-    point = pose[9:] + foremost(scene.tool, pose[:9].reshape(3, 3), inward)
+    turned = pose[:9].reshape(3, 3)
+    point = pose[9:] + (0 if tool is None else foremost(tool, turned, inward))
     return Frame(status, pose, force, depth, point, seconds, vertices)
 
 
@@ -98,7 +112,9 @@ def packet(text: dict, arrays: dict[str, np.ndarray]) -> bytes:
     return np.uint32(len(head)).tobytes() + head + b"".join(parts)
 
 
-def tube_arrays(vertices, faces, ring: np.ndarray, midline: np.ndarray, tool: Shape) -> dict:
+def tube_arrays(
+    vertices, faces, ring: np.ndarray, midline: np.ndarray, tool: Shape | None
+) -> dict[str, np.ndarray]:
     """Arrays of a packet: the wall at rest and the surface of the tool.
 
     Args:
@@ -106,9 +122,9 @@ def tube_arrays(vertices, faces, ring: np.ndarray, midline: np.ndarray, tool: Sh
         faces: of the wall; shape (faces, 3).
         ring: vertices on a ring; bool, shape (vertices,).
         midline: of each ring, the vertex on the anterior midline.
-        tool: about its origin.
+        tool: about its origin; None: there is none.
     """
-    corners, sides = tool_surface(tool)
+    corners, sides = (np.zeros((0, 3)),) * 2 if tool is None else tool_surface(tool)
     return {
         "rest": np.asarray(vertices, np.float32), "faces": np.asarray(faces, np.uint32),
         "joints": midline.astype(np.uint32), "tool": corners.astype(np.float32),
@@ -118,10 +134,7 @@ def tube_arrays(vertices, faces, ring: np.ndarray, midline: np.ndarray, tool: Sh
 
 def scene_packet(scene: Scene, title: str, pose: np.ndarray) -> bytes:
     """What a page must know of a scene before the first frame."""
-    assert scene.mesh is not None
-    assert scene.tool is not None
-    where = rings_on(scene)
-    arrays = tube_arrays(scene.mesh.vertices, scene.mesh.faces, *where, scene.tool)
+    arrays = tube_arrays(*tube_of(scene), scene.tool)
     return packet({"title": title, "pose": pose.tolist(), "statuses": statuses()}, arrays)
 
 
@@ -132,14 +145,30 @@ def statuses() -> dict[int, list]:
     }
 
 
-def rings_on(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices that lie on a ring (bool), and the vertex of each ring on the anterior midline."""
+def tube_of(scene: Scene) -> tuple[Any, Any, np.ndarray, np.ndarray]:
+    """Vertices, faces, and `rings_on` of the wall of a scene."""
     mesh, tube = scene.mesh, scene.geometry
     assert mesh is not None
-    s, phi, distance = (np.asarray(v, float) for v in (mesh.s, mesh.phi, mesh.distance))
-    x = np.asarray(tube.ring_positions, float)
-    away = np.abs(s[:, None] - x)
-    ring = (away.min(axis=1) <= float(tube.ring_height) / 2) & (abs(phi) <= float(tube.half_angle))
+    rings = {"position": tube.ring_positions, "height": tube.ring_height,
+             "half_angle": tube.half_angle}  # fmt: skip
+    where = rings_on(mesh.s, mesh.phi, mesh.distance, rings)
+    return mesh.vertices, mesh.faces, *where
+
+
+def rings_on(s, phi, distance, rings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that lie on a ring (bool), and the vertex of each ring on the anterior midline.
+
+    Args:
+        s: of the vertices along the centreline, mm.
+        phi: round it, rad.
+        distance: from it, mm.
+        rings: `position` of each and `height`, mm, and `half_angle`, rad.
+    """
+    s, phi, distance = (np.asarray(v, float) for v in (s, phi, distance))
+    away = np.abs(s[:, None] - np.asarray(rings["position"], float))
+    ring = (away.min(axis=1) <= float(rings["height"]) / 2) & (
+        abs(phi) <= float(rings["half_angle"])
+    )
     return ring, np.hypot(away, (distance * phi)[:, None]).argmin(axis=0)
 
 
@@ -162,12 +191,12 @@ def tool_surface(tool: Shape) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _directions() -> np.ndarray:
-    """Unit vectors spread evenly over a sphere; shape (240, 3).
+    """Unit vectors spread evenly over a sphere; shape (600, 3).
 
     Fibonacci's lattice, and both poles of each axis, so that a tool is as wide as it is.
     """
-    i = np.arange(234) + 0.5
-    z, turn = 1 - 2 * i / 234, np.pi * (1 + 5**0.5) * i
+    i = np.arange(594) + 0.5
+    z, turn = 1 - 2 * i / 594, np.pi * (1 + 5**0.5) * i
     r = np.sqrt(1 - z * z)
     lattice = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
     return np.concatenate([lattice, np.eye(3), -np.eye(3)])

@@ -71,10 +71,10 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
     """The specification of a tool that goes anywhere, and what that leaves out."""
     wanted, notes = spec.effects, []
     changes = {"second_plane": "on", "width": "point", "surface": "auto", "dent": "16"}
-    material = spec.material
+    material = None if spec.material is None else spec.material.model_dump()
     if material is not None:
-        changes |= {"skeleton": "linear", "axial": "on" if material.EA_L is not None else "off"}
-        if material.e_1 is not None:
+        changes |= {"skeleton": "linear", "axial": "on" if material["EA_L"] is not None else "off"}
+        if material["e_1"] is not None:
             notes.append("skeleton: linear, since a softening one is for the midline alone")
     if wanted.surface not in ("auto", "off"):
         changes["surface"] = wanted.surface
@@ -92,9 +92,7 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
         update={
             "effects": wanted.model_copy(update=changes),
             "output": spec.output.model_copy(update={"surface": True, "joints": False}),
-            "model": spec.model.model_copy(
-                update={"contact": "bonded" if glued else "unilateral"}
-            ),
+            "model": spec.model.model_copy(update={"contact": "bonded" if glued else "unilateral"}),
             "tool": spec.tool or ToolSection.model_validate(FINGER),
             "path": [PathSection.model_validate(away)],
             "plan": None,
@@ -106,7 +104,9 @@ def _rubs(spec: SceneSpec) -> bool:
     """Whether a tool of this scene sticks and slides by Coulomb's law."""
     known = spec.tool is not None and spec.tool.friction is not None
     wished = spec.effects.friction != "off" and spec.effects.contact_point != "per_step"
-    return known and wished and (spec.model.contact, spec.model.coupling) == ("unilateral", "series")
+    return (
+        known and wished and (spec.model.contact, spec.model.coupling) == ("unilateral", "series")
+    )
 
 
 def _words(tool: dict[str, str]) -> str:

@@ -2,12 +2,12 @@
 
 import re
 import tomllib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxtrachea.scene.plan import Plan
-from jaxtrachea.trachea.material import VALUES, Declaration, Material
+from jaxtrachea.trachea.material import VALUES, Declaration
 
 #: A slider goes from the value over this to the value times this.
 SPAN = 10.0
@@ -50,17 +50,19 @@ class Slider(NamedTuple):
 
 def is_read(parameter: Declaration, plan: Plan) -> bool:
     """Whether a plan reads a parameter of a line of joints."""
-    level = plan.options.skeleton
     if parameter.name in ("k_A", "k_B"):
         return plan.end_motion
+    if parameter.name == "GA_side":
+        return plan.has("shear") and plan.second_plane
+    bends = plan.rings != "mat"
     return {
         "": True, "shear": plan.has("shear"), "two-material": plan.has("two_material"),
-        "softening": level == "softening", "axial": plan.axial, "arch": plan.rings != "mat",
-        "arch, sections": plan.rings != "mat", "second plane": plan.second_plane,
-    }.get(parameter.needs, False) and (parameter.name != "GA_side" or plan.has("shear"))  # fmt: skip
+        "softening": plan.options.skeleton == "softening", "axial": plan.axial, "arch": bends,
+        "arch, sections": bends, "second plane": plan.second_plane,
+    }.get(parameter.needs, False)  # fmt: skip
 
 
-def sliders(material: Material, plan: Plan) -> list[Slider]:
+def sliders(material: Any, plan: Plan) -> list[Slider]:
     """One for every given parameter that the plan reads."""
     found = []
     for name, p in VALUES.items():
