@@ -337,7 +337,7 @@ def test_dragged_about_the_wall_no_row_needs_another_plan(server):
                     found.append(PressStatus(int(head[0])))
     assert len(found) == 125
     assert PressStatus.OFF_PLAN not in found
-    assert found.count(PressStatus.OK) >= 90
+    assert found.count(PressStatus.OK) >= 75
 
 
 @needs_browser

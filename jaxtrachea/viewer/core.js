@@ -98,7 +98,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   number.dataset.role = "force";
   const second = make("div", head, {}, ""); second.dataset.role = "detail";
   const third = make("div", head, { fontSize: "12px" }, ""); third.dataset.role = "place";
-  const legend = make("div", el, { ...over, left: "8px", bottom: "8px", width: "220px", padding: "6px",
+  const legend = make("div", el, { ...over, left: "8px", bottom: "8px", width: "220px", boxSizing: "content-box", padding: "6px",
     background: "rgba(255,255,255,.8)", borderRadius: "4px", fontSize: "12px" });
   const bar = make("canvas", legend, { width: "220px", height: "12px", display: "block" });
   bar.width = 256; bar.height = 1;

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from jaxtrachea.scene.session import Session
@@ -175,7 +175,7 @@ class Live:
         now = session.material
         assert isinstance(now, Material)  # a session has no other
         new = {
-            name: jnp.asarray(np.asarray(value, getattr(now, name).dtype))
+            name: jax.device_put(np.asarray(value, getattr(now, name).dtype))
             for name, value in values.items()
             if float(getattr(now, name)) != value
         }
