@@ -154,7 +154,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
       if (values[i] > top) top = values[i];
     }
     const stale = last !== null && !last.solved;
-    const inside = option.print ? printed() : null;
+    const inside = option.print && tool.visible ? printed() : null;
     for (let i = 0; i < n; i++) {
       const k = 3 * Math.round(255 * Math.min(values[i] / top, 1));
       const light = option.rings && ring[i] ? 0.12 : 0, dim = inside && inside[i] ? 0.3 : 1;
@@ -182,7 +182,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     const p = (i) => new T.Vector3().fromArray(corners, 3 * i);
     for (let f = 0; f < sides.length; f += 3) {
       const a = p(sides[f]), w = p(sides[f + 1]).sub(a).cross(p(sides[f + 2]).sub(a));
-      if (w.length() > 1e-12) { w.normalize(); spaces.push([w.x, w.y, w.z, w.dot(a)]); }
+      if (w.length() > 1e-12) { w.normalize(); spaces.push(w.x, w.y, w.z, w.dot(a)); }
     }
   }
   let widest = 0;
@@ -194,7 +194,9 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     for (let i = 0; i < n; i++) {
       if (Math.hypot(rest[3 * i] - p.x, rest[3 * i + 1] - p.y, rest[3 * i + 2] - p.z) > widest) continue;
       x.fromArray(rest, 3 * i).applyMatrix4(back);
-      out[i] = spaces.every((s) => s[0] * x.x + s[1] * x.y + s[2] * x.z <= s[3]) ? 1 : 0;
+      let k = 0;
+      while (k < spaces.length && spaces[k] * x.x + spaces[k + 1] * x.y + spaces[k + 2] * x.z <= spaces[k + 3]) k += 4;
+      out[i] = k >= spaces.length ? 1 : 0;
     }
     return out;
   }

@@ -71,6 +71,7 @@ class Page:
         self.status = ui.label().style("font-size:16px").mark("status").props("id=status")
         self.body = ui.row().style("width:100%;flex-wrap:nowrap;gap:12px")
         self.timer = ui.timer(0.1, self.follow)
+        self.curve_timer = ui.timer(0.4, self.follow_curve)
         self.follow()
 
     def follow(self) -> None:
@@ -83,8 +84,11 @@ class Page:
             with self.body:
                 self.ready()
         self.phase = state.phase
-        if self.phase == "ready" and live.frame is not self.shown:
-            self.shown = live.frame
+
+    def follow_curve(self) -> None:
+        """Draw the curve where there is a new frame; more often it would slow the view."""
+        if self.phase == "ready" and self.live.frame is not self.shown:
+            self.shown = self.live.frame
             self.draw_curve()
 
     def ready(self) -> None:
@@ -174,7 +178,7 @@ class Page:
 
     def draw_curve(self) -> None:
         """Force over depth of the last steps that have a force."""
-        data = [[f.depth, float((f.force**2).sum() ** 0.5)] for f in self.live.steps[-500:]
+        data = [[f.depth, float((f.force**2).sum() ** 0.5)] for f in self.live.steps[-300:]
                 if f.has_force]  # fmt: skip
         self.chart.options["series"][0]["data"] = data
         self.chart.update()
@@ -222,6 +226,7 @@ class Page:
     def lost(self, code: object) -> None:
         """Say why the frames have stopped."""
         self.timer.deactivate()
+        self.curve_timer.deactivate()
         why = "this scene is open in another page; reload to go on here"
         if str(code) != "4409":
             why = "the connection is lost; reload, or start jaxtrachea view again"

@@ -12,7 +12,7 @@ export default {
     this.view = window.trachea = view;
     socket.onmessage = (m) => {
       view.frame(m.data);
-      requestAnimationFrame(() => requestAnimationFrame(() => send("drawn")));
+      requestAnimationFrame(() => send("drawn")); // the view has asked for its turn before
     };
     socket.onclose = (e) => this.$emit("lost", e.code);
   },
