@@ -135,7 +135,7 @@ WITHIN = {
         {"choice"},
         {"measure"},
     ],
-    "viewer": [{"scene", "values"}, {"protocol"}, {"live", "play"}, {"server"}, {"page"}],
+    "viewer": [{"frame", "scene", "values"}, {"protocol"}, {"live", "play"}, {"server"}, {"page"}],
     "report": [{"plots", "tables", "understood"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table", "specification", "options", "beside"}, {"terminal"},
             {"file_options", "fit", "load", "predict_data", "run", "scene", "selfcheck"},

@@ -29,8 +29,8 @@ from websockets.sync.client import connect
 
 from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.status import PressStatus
+from jaxtrachea.viewer.frame import LONGEST, Frame, read_pose
 from jaxtrachea.viewer.play import PlayError, of_file
-from jaxtrachea.viewer.protocol import LONGEST, Frame, read_pose
 from jaxtrachea.viewer.scene import for_a_mouse
 from jaxtrachea.viewer.values import Slider, with_values
 

@@ -32,7 +32,6 @@ def view(scene: SceneArgument, port: PortOption = None, no_browser: NoBrowser = 
     except OSError as error:
         cure = "choose another, or leave --port out"
         raise Stop(f"--port: {port} cannot be used ({error.strerror}); {cure}") from None
-    set_up_jax()
     from jaxtrachea.viewer.page import serve
 
     def opened(address: str) -> None:
@@ -40,7 +39,7 @@ def view(scene: SceneArgument, port: PortOption = None, no_browser: NoBrowser = 
         if not no_browser and not _open(address):
             to_stderr("no browser could be opened: open the address yourself, or use --no-browser")
 
-    serve(scene, port, opened)
+    serve(scene, port, opened, set_up_jax)
 
 
 def play(

@@ -1,4 +1,7 @@
-"""One `Session` in one thread: poses and values in, frames out, the latest of each wins."""
+"""One `Session` in one thread: poses and values in, frames out, the latest of each wins.
+
+What is slow to import is imported by the thread: the page is up before.
+"""
 
 import dataclasses
 import threading
@@ -6,16 +9,11 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import jax
 import numpy as np
 
-from jaxtrachea.scene.session import Session
-from jaxtrachea.trachea.material import Material
-from jaxtrachea.viewer.protocol import Frame, frame_of, scene_packet
-from jaxtrachea.viewer.scene import Handled, read_handled
-from jaxtrachea.viewer.values import Slider, sliders
+from jaxtrachea.viewer.frame import Frame
 
 Phase = Literal["reading", "compiling", "ready", "failed"]
 #: Steps that the curve keeps, and bytes of frames that a recording keeps.
@@ -37,6 +35,7 @@ class Live:
 
     Attributes:
         path: of the scene file.
+        changed: called by the thread when there is a new frame or state.
         state: where the work stands.
         fault: the last error of a step; empty: none.
         handled: the scene, once it is read.
@@ -47,17 +46,18 @@ class Live:
         recording: frames that are kept; None: nothing is recorded.
     """
 
-    def __init__(self, path: Path, changed: Callable[[], None] = lambda: None):
+    def __init__(self, path: Path, set_up: Callable[[], None] = lambda: None):
         """Nothing is read yet.
 
         Args:
             path: of the scene file.
-            changed: called by the thread when there is a new frame or state.
+            set_up: called by the thread before it reads.
         """
-        self.path, self.changed = path, changed
+        self.path, self.set_up = path, set_up
+        self.changed: Callable[[], None] = lambda: None
         self.state, self.fault = State("reading", f"reading {path.name}"), ""
-        self.handled: Handled | None = None
-        self.sliders: list[Slider] = []
+        self.handled: Any = None
+        self.sliders: list[Any] = []
         self.packet = b""
         self.frame: Frame | None = None
         self.steps: list[Frame] = []
@@ -124,9 +124,15 @@ class Live:
     @property
     def values(self) -> dict[str, float]:
         """Of all sliders, as they are now."""
-        return {s.name: self._values.get(s.name, s.value) for s in self.sliders}
+        return {s.name: s.value for s in self.sliders} | self._values
 
-    def _prepare(self) -> Session:
+    def _prepare(self) -> Any:
+        """The session."""
+        self.set_up()
+        from jaxtrachea.viewer.protocol import scene_packet
+        from jaxtrachea.viewer.scene import read_handled
+        from jaxtrachea.viewer.values import sliders
+
         handled = read_handled(self.path, lambda text: self._tell("reading", text))
         self.handled = handled
         scene = handled.staged.scene
@@ -145,7 +151,7 @@ class Live:
         self.state = State(phase, text)
         self.changed()
 
-    def _answer(self, session: Session) -> bool:
+    def _answer(self, session: Any) -> bool:
         """One step; whether to go on."""
         with self._wake:
             self._wake.wait_for(lambda: self._pose is not None or self._ended)
@@ -170,10 +176,11 @@ class Live:
         self.changed()
         return True
 
-    def _set(self, session: Session, values: dict[str, float]) -> None:
+    def _set(self, session: Any, values: dict[str, float]) -> None:
         """Other values of the material, where they are others."""
+        import jax
+
         now = session.material
-        assert isinstance(now, Material)  # a session has no other
         new = {
             name: jax.device_put(np.asarray(value, getattr(now, name).dtype))
             for name, value in values.items()
@@ -182,7 +189,9 @@ class Live:
         if new:
             session.set_material(dataclasses.replace(now, **new))
 
-    def _step(self, session: Session, pose: np.ndarray) -> Frame:
+    def _step(self, session: Any, pose: np.ndarray) -> Frame:
+        from jaxtrachea.viewer.protocol import frame_of
+
         begin = time.perf_counter()
         result = session.step(pose[:9].reshape(3, 3), pose[9:])
         seconds = time.perf_counter() - begin

@@ -5,6 +5,7 @@ import io
 import secrets
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from nicegui import app, ui
 from nicegui.element import Element
@@ -12,7 +13,6 @@ from nicegui.elements.scene.scene import Scene as _Scene  # registers the module
 
 from jaxtrachea.viewer.live import Live
 from jaxtrachea.viewer.server import Frames, Guard, add_routes
-from jaxtrachea.viewer.values import Slider, with_values
 
 __all__ = ["serve"]
 
@@ -27,16 +27,17 @@ class Wall(Element, component="wall.js"):
     """The view of the scene."""
 
 
-def serve(path: Path, port: int, opened: Callable[[str], None]) -> None:
+def serve(path: Path, port: int, opened: Callable[[str], None], set_up: Callable[[], None]) -> None:
     """Serve the page of a scene on 127.0.0.1 until Ctrl-C.
 
     Args:
         path: of the scene file.
         port: that is free.
         opened: called with the address when the page can be opened.
+        set_up: called by the thread of the session before it reads.
     """
     token = secrets.token_urlsafe(24)
-    live = Live(path)
+    live = Live(path, set_up)
     frames = Frames(live)
     live.changed = frames.changed
     app.add_middleware(Guard, port=port, token=token)
@@ -77,8 +78,12 @@ class Page:
     def follow(self) -> None:
         """Show the phase, and what is new since the last call."""
         state, live = self.live.state, self.live
-        text = f"{state.phase}: {state.text}" if state.phase != "ready" else live.fault
-        self.status.set_text(text if state.text != state.phase else state.phase)
+        text = state.text
+        if state.phase == "ready":
+            text = live.fault
+        elif not text.startswith(state.phase):
+            text = f"{state.phase}: {text}"
+        self.status.set_text(text)
         self.status.set_visibility(bool(text))
         if state.phase == "ready" and self.phase != "ready":
             with self.body:
@@ -144,7 +149,7 @@ class Page:
                 "dense no-caps size=sm padding='3px 8px' id=reset"
             )
 
-    def slider(self, s: Slider):
+    def slider(self, s: Any):
         """A slider over the shares 0 to 1, with the value beside it."""
         with ui.row().style("width:100%;gap:8px;align-items:center;flex-wrap:nowrap"):
             ui.label(s.name).style("width:52px").tooltip(s.description)
@@ -198,6 +203,8 @@ class Page:
 
     def save_values(self) -> None:
         """The scene file with the values of the sliders."""
+        from jaxtrachea.viewer.values import with_values
+
         try:
             new = with_values(self.live.path.read_text("utf-8-sig"), self.live.values)
         except (OSError, ValueError) as error:
@@ -214,7 +221,6 @@ class Page:
             return
         frames, live.recording = live.recording, None
         self.recorder.set_text("record")
-        assert live.handled is not None
         if not any(f.vertices is not None for f in frames):
             ui.notify("nothing was recorded: no step with a surface", type="warning")
             return

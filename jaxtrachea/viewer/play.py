@@ -17,15 +17,8 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.scene.results import SCHEMA, SCHEMA_VERSION
 from jaxtrachea.scene.stage import Scene
-from jaxtrachea.viewer.protocol import (
-    Frame,
-    frame_of,
-    packet,
-    rings_on,
-    statuses,
-    tube_arrays,
-    tube_of,
-)
+from jaxtrachea.viewer.frame import Frame, packet, statuses
+from jaxtrachea.viewer.protocol import frame_of, rings_on, tube_arrays, tube_of
 
 HERE = Path(__file__).parent
 #: Bytes of displacements in a page at most; of a longer recording some rows are left out, evenly.

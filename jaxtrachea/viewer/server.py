@@ -11,8 +11,8 @@ from urllib.parse import parse_qs
 from fastapi import FastAPI, Response, WebSocket
 from starlette.websockets import WebSocketDisconnect
 
+from jaxtrachea.viewer.frame import read_pose
 from jaxtrachea.viewer.live import Live
-from jaxtrachea.viewer.protocol import read_pose
 
 HERE = Path(__file__).parent
 #: Codes with which a socket closes: refused, a message that is none, another page took over.
