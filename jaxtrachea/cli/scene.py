@@ -68,7 +68,6 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     """Move the tool along its path: forces, deformed mesh, pictures."""
     import jax
 
-    from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.results import (
         last_solved,
@@ -81,7 +80,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
     if spec.output.play:
-        from jaxtrachea.viewer.play import PlayError, of_file, three_js
+        from jaxtrachea.viewer.play import PlayError, three_js
 
         try:
             three_js()
@@ -104,10 +103,9 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
             made = _provenance(scene, staged, clock)
             motion = staged.material, staged.path
             write_simulation(folder / "simulation.h5", staged.scene, *motion, out, made)
-            if spec.output.play:
-                write_text(folder / "play.html", of_file(folder / "simulation.h5", title))
+            lost = _write_play(folder, title) if spec.output.play else {}
             _write_json(folder, made)
-            say_lost(drawing.result())
+            say_lost(drawing.result() | lost)
     _print_rows(out)
     failed = _print_failures(out.status, "row(s)")
     for note in staged.notes:
@@ -305,6 +303,19 @@ def _draw(folder: Path, title: str, pictures: bool, scene, out) -> dict[str, str
     if out.vertices is not None and row is not None:
         drawings["surface.png"] = partial(draw_surface, scene, np.asarray(out.vertices[row]), title)
     return save_each(folder, drawings)[1]
+
+
+def _write_play(folder: Path, title: str) -> dict[str, str]:
+    """Write play.html; why it could not be, by file name."""
+    from jaxtrachea.files.atomic import write_text
+    from jaxtrachea.viewer.play import PlayError, of_file
+
+    try:
+        page = of_file(folder / "simulation.h5", title)
+    except PlayError as error:
+        return {"play.html": error.found}
+    write_text(folder / "play.html", page)
+    return {}
 
 
 def _provenance(scene: Path, staged, clock: list[float]) -> dict:
