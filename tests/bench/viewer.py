@@ -6,6 +6,7 @@ Chromium draws by software here (SwiftShader) unless the flags of `browser` are 
 are a lower bound. The server and the browser share the processor.
 """
 
+import contextlib
 import json
 import os
 import re
@@ -64,31 +65,27 @@ RATE = """(async () => {
 def measure(vertices):
     """One row: all rates of a tube of so many vertices (lids included)."""
     around, along = SIZES[vertices]
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, contextlib.closing(Browser()) as window:
         scene = Path(folder) / "rates.toml"
         scene.write_text(SCENE.format(around=around, along=along))
         command = [sys.executable, "-m", "jaxtrachea", "view", str(scene), "--no-browser"]
         begin = time.perf_counter()
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as server:
-            address = re.search(r"http\S+", server.stdout.readline())[0]
-            row = {"address": time.perf_counter() - begin}
             try:
-                return row | with_browser(address, begin) | without(address)
+                address = re.search(r"http\S+", server.stdout.readline())[0]
+                row = {"address": time.perf_counter() - begin}
+                return row | with_browser(window, address, begin) | without(address)
             finally:
                 server.terminate()
 
 
-def with_browser(address, begin):
-    window = Browser()
-    try:
-        window.go(address)
-        window.wait("document.querySelector('#status')?.innerText")
-        up = time.perf_counter() - begin
-        window.wait("window.trachea?.last", 900)
-        found = window.run(RATE)
-    finally:
-        window.close()
-    return {"page up (with the start of Chromium)": up, "scene": time.perf_counter() - begin,
+def with_browser(window, address, begin):
+    window.go(address)
+    window.wait("document.querySelector('#status')?.innerText")
+    up = time.perf_counter() - begin
+    window.wait("window.trachea?.last", 900)
+    found = window.run(RATE)
+    return {"page up": up, "scene": time.perf_counter() - begin,
             "frames / s": found["rates"][0], "drawn / s": found["rates"][1],
             "lag ms": found["lag"], "bytes": found["bytes"]}  # fmt: skip
 
