@@ -53,6 +53,7 @@ def serve(path: Path, port: int, opened: Callable[[str], None], set_up: Callable
     ui.run(
         host="127.0.0.1", port=port, show=False, reload=False, tailwind=False, favicon="🫁",
         show_welcome_message=False, gzip_middleware_factory=None, ws_max_size=2**16,
+        reconnect_timeout=30,  # a page that draws slowly is not a page that has gone
     )  # fmt: skip
 
 
