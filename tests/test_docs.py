@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 #: What a user reads, in this order.
-PATH = ["install", "fit", "read_a_fit", "after_a_fit", "simulate", "layer", "haptics"]
+PATH = ["install", "fit", "read_a_fit", "after_a_fit", "simulate", "view", "layer", "haptics"]
 #: Commands that are shown without a placeholder, and the test that runs each.
 RUN_BY = {
     "--version": "test_cli.py",

@@ -30,14 +30,16 @@ ORDER = [
     {"results"},
     {"prediction", "runs"},
     {"report"},
-    {"tradeoff"},
+    {"tradeoff", "viewer"},
     {"cli"},
     {"__main__"},
 ]
 #: Neighbours that stand on different levels.
 STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}),
              ("inference", {"scene"}), ("results", {"scene"}), ("prediction", {"scene", "runs"}),
-             ("runs", {"scene"}), ("measurements", {"contact", "mechanics", "trachea"}),
+             ("runs", {"scene"}),
+             ("viewer", {"mechanics", "fitting", "inference", "results"}),
+             ("measurements", {"contact", "mechanics", "trachea"}),
              ("inference/analyses", {"results", "report", "scene"})]  # fmt: skip
 #: Modules within the larger rooms, from the bottom up.
 WITHIN = {
@@ -135,11 +137,12 @@ WITHIN = {
         {"choice"},
         {"measure"},
     ],
+    "viewer": [{"frame", "scene", "values"}, {"protocol"}, {"live", "play"}, {"server"}, {"page"}],
     "report": [{"plots", "tables", "understood"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table", "specification", "options", "beside"}, {"terminal"},
             {"file_options", "fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"sources"}, {"written_spec"},
-            {"compare", "cache", "convert", "init", "predict", "tradeoff"}, {"main"}],
+            {"compare", "cache", "convert", "init", "predict", "tradeoff", "view"}, {"main"}],
 }  # fmt: skip
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]

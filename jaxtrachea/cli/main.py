@@ -28,6 +28,7 @@ from jaxtrachea.cli import predict as cli_predict
 from jaxtrachea.cli import scene as cli_scene
 from jaxtrachea.cli import selfcheck as cli_selfcheck
 from jaxtrachea.cli import tradeoff as cli_tradeoff
+from jaxtrachea.cli import view as cli_view
 from jaxtrachea.cli.file_options import CheckOptions
 from jaxtrachea.cli.load import load, with_zeros_of_fits
 from jaxtrachea.cli.options import DataOption, FitOptions, OutOption, SpecArgument, with_fields
@@ -52,7 +53,7 @@ app = typer.Typer(
     help=(
         "Mechanics of the trachea: identify stiffnesses from force-displacement curves "
         "(check, init, fit, predict, design, compare, convert); simulate a tool on a trachea "
-        "(plan, simulate, sweep)."
+        "(plan, simulate, sweep, view, play)."
     ),
 )
 #: Rows of a terminal table; the files hold all.
@@ -195,7 +196,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
 
 for _command in (
     cli_compare.compare, cli_convert.convert, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
-    cli_tradeoff.tradeoff, cli_selfcheck.selfcheck, cli_cache.cache,
+    cli_view.view, cli_view.play, cli_tradeoff.tradeoff, cli_selfcheck.selfcheck, cli_cache.cache,
 ):  # fmt: skip
     app.command()(_command)
 

@@ -79,6 +79,13 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
+    if spec.output.play:
+        from jaxtrachea.viewer.play import PlayError, three_js
+
+        try:
+            three_js()
+        except PlayError as error:
+            raise Stop(f"{scene}: output.play: {error}") from None
     staged, choice = _chosen(scene, spec, staged)
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
@@ -94,9 +101,11 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
             write_meshes(folder, staged.scene, out)
             write_forces(folder / "forces.csv", out)
             made = _provenance(scene, staged, clock)
-            write_simulation(folder / "simulation.h5", staged.scene, staged.path, out, made)
+            motion = staged.material, staged.path
+            write_simulation(folder / "simulation.h5", staged.scene, *motion, out, made)
+            lost = _write_play(folder, title) if spec.output.play else {}
             _write_json(folder, made)
-            say_lost(drawing.result())
+            say_lost(drawing.result() | lost)
     _print_rows(out)
     failed = _print_failures(out.status, "row(s)")
     for note in staged.notes:
@@ -294,6 +303,19 @@ def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, st
     if out.vertices is not None and row is not None:
         drawings["surface.png"] = partial(draw_surface, *shown, row, title)
     return save_each(folder, drawings)[1]
+
+
+def _write_play(folder: Path, title: str) -> dict[str, str]:
+    """Write play.html; why it could not be, by file name."""
+    from jaxtrachea.files.atomic import write_text
+    from jaxtrachea.viewer.play import PlayError, of_file
+
+    try:
+        page = of_file(folder / "simulation.h5", title)
+    except PlayError as error:
+        return {"play.html": error.found}
+    write_text(folder / "play.html", page)
+    return {}
 
 
 def _provenance(scene: Path, staged, clock: list[float]) -> dict:

@@ -8,13 +8,16 @@ import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.files.table import Table
+from jaxtrachea.mechanics.levels.choose import AnyMaterial
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.scene.sweep import Sweep
 from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.material import VALUES
 
-SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 1
+SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 2
 
 #: Unit of every series; what is not named is in mm.
 UNITS = {"phi": "rad", "force": "N", "loads": "N", "moment": "N mm", "dissipated": "N mm",
@@ -34,7 +37,12 @@ def plan_rows(plan: Plan, shares: dict[str, float]) -> list[list[str]]:
 
 
 def write_simulation(
-    path: Path, scene: Scene, motion: Poses | Presses, out: Simulation, provenance: dict
+    path: Path,
+    scene: Scene,
+    material: AnyMaterial,
+    motion: Poses | Presses,
+    out: Simulation,
+    provenance: dict,
 ) -> None:
     """All series of a simulation; one dataset each, its unit as attribute (docs/simulate.md)."""
     with hdf5_file(path) as file:
@@ -49,10 +57,34 @@ def write_simulation(
             tool = file.create_group("tool")
             tool.create_dataset("translation", data=motion.translation).attrs["unit"] = "mm"
             tool.create_dataset("rotation", data=motion.rotation).attrs["unit"] = "1"
+            if scene.tool is not None:
+                tool.create_dataset("vertices", data=scene.tool.vertices).attrs["unit"] = "mm"
+                tool.create_dataset("radius", data=scene.tool.radius).attrs["unit"] = "mm"
+        _write_rings(file.create_group("rings"), scene)
+        _write_material(file.create_group("material"), material)
         if scene.mesh is not None:
             rest = file.create_group("rest")
-            rest.create_dataset("vertices", data=scene.mesh.vertices).attrs["unit"] = "mm"
-            rest.create_dataset("faces", data=scene.mesh.faces).attrs["unit"] = "1"
+            for name in ("vertices", "faces", "s", "phi", "distance"):
+                data = rest.create_dataset(name, data=getattr(scene.mesh, name))
+                data.attrs["unit"] = {"faces": "1", "phi": "rad"}.get(name, "mm")
+
+
+def _write_rings(group: h5py.Group, scene: Scene) -> None:
+    """Where the rings are, and how large."""
+    tube = scene.geometry
+    for name, value, unit in (
+        ("position", tube.ring_positions, "mm"), ("height", tube.ring_height, "mm"),
+        ("radius", tube.radius, "mm"), ("half_angle", tube.half_angle, "rad"),
+    ):  # fmt: skip
+        group.create_dataset(name, data=value).attrs["unit"] = unit
+
+
+def _write_material(group: h5py.Group, material: AnyMaterial) -> None:
+    """Every value that is given, with its unit."""
+    declared = VALUES | SECTION_VALUES
+    for name, value in vars(material).items():
+        if value is not None and name in declared:
+            group.create_dataset(name, data=value).attrs["unit"] = declared[name].unit
 
 
 def write_forces(path: Path, out: Simulation) -> None:

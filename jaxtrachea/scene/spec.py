@@ -354,6 +354,14 @@ class OutputSection(Section):
     """motion of the ends of the rings"""
     pictures: bool = True
     """series.png, surface.png"""
+    play: bool = False
+    """play.html: the simulation as a page that plays in any browser (extra `viewer`)"""
+
+    @model_validator(mode="after")
+    def _surface_to_play(self) -> "OutputSection":
+        if self.play and not self.surface:
+            raise ValueError("play needs surface = true; remove one")
+        return self
 
 
 class PlanSection(Section):

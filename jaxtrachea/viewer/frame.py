@@ -1,0 +1,109 @@
+"""Bytes between the model and the page: one packet for the scene, one frame for every step.
+
+Packet: length of a JSON text (uint32), the text, then the arrays that its `arrays` names, each from
+a multiple of four bytes on. Frame: ten float32 (`Head`), then the positions of all vertices
+(float32, mm); no positions where the step has no solution. No number of either is NaN.
+"""
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxtrachea.status import PressStatus
+
+#: Largest coordinate of a tool that is taken from a page, mm.
+FARTHEST = 1e4
+#: Longest message that a page may send, bytes.
+LONGEST = 4096
+
+
+class Frame(NamedTuple):
+    """What one step shows.
+
+    Attributes:
+        status: of the step.
+        pose: rotation by rows, then the translation, mm; shape (12,).
+        force: on the tube in the frame of the mesh, N; shape (3,). Zeros: no solution.
+        depth: of the tool below the wall at rest, mm, not negative.
+        point: of the contact on the tool, mm; shape (3,).
+        seconds: that the step took.
+        vertices: of the wall, mm, float32; shape (vertices, 3). None: no solution.
+    """
+
+    status: PressStatus
+    pose: Float[np.ndarray, "12"]
+    force: Float[np.ndarray, "3"]
+    depth: float
+    point: Float[np.ndarray, "3"]
+    seconds: float
+    vertices: np.ndarray | None
+
+    @property
+    def has_force(self) -> bool:
+        """Whether there is a force to show: the step is solved, and the tool touches."""
+        return self.vertices is not None and self.status != PressStatus.NO_CONTACT
+
+    @property
+    def light(self) -> "Frame":
+        """The same without its vertices, for long lists."""
+        return self._replace(vertices=None if self.vertices is None else self.vertices[:0])
+
+    def pack(self) -> bytes:
+        """As bytes; see the module."""
+        vertices = b"" if self.vertices is None else np.ascontiguousarray(self.vertices).tobytes()
+        return self.head.tobytes() + vertices
+
+    @property
+    def head(self) -> np.ndarray:
+        """Status, vertices, force (3), depth, point (3), milliseconds; float32."""
+        count = 0 if self.vertices is None else len(self.vertices)
+        values = [self.status, count, *self.force, self.depth, *self.point, 1e3 * self.seconds]
+        return np.array(values, np.float32)
+
+
+def packet(text: dict, arrays: dict[str, np.ndarray]) -> bytes:
+    """A text and named arrays as bytes; see the module."""
+    parts, listed, start = [], [], 0
+    for name, array in arrays.items():
+        data = np.ascontiguousarray(array).tobytes()
+        listed.append([name, array.dtype.name, start, array.size])
+        parts.append(data.ljust(-(-len(data) // 4) * 4, b"\0"))
+        start += len(parts[-1])
+    head = json.dumps(text | {"arrays": listed}, allow_nan=False).encode()
+    head = head.ljust(-(-len(head) // 4) * 4)
+    return np.uint32(len(head)).tobytes() + head + b"".join(parts)
+
+
+def statuses() -> dict[int, list]:
+    """Of each status its name, its sentence, and whether there is a force."""
+    return {
+        int(s): [s.name, s.message, s.solved and s != PressStatus.NO_CONTACT] for s in PressStatus
+    }
+
+
+def read_pose(text: str) -> np.ndarray | None:
+    """A pose that a page sends, `{"pose": [12 numbers]}`; None: it acknowledges a frame.
+
+    Raises:
+        ValueError: any other text, numbers that are too large or not finite, or no rotation.
+    """
+    if len(text) > LONGEST:
+        raise ValueError("too long")
+    message = json.loads(text)
+    if message == "drawn":
+        return None
+    if not isinstance(message, dict) or set(message) != {"pose"}:
+        raise ValueError("neither a pose nor an acknowledgement")
+    numbers = message["pose"]
+    kinds = isinstance(numbers, list) and all(type(v) in (int, float) for v in numbers)
+    if not kinds or len(numbers) != 12:
+        raise ValueError("expected 12 numbers")
+    pose = np.array(numbers, float)
+    if not np.isfinite(pose).all() or abs(pose).max() > FARTHEST:
+        raise ValueError("a number is too large or not finite")
+    turn = pose[:9].reshape(3, 3)
+    if abs(turn @ turn.T - np.eye(3)).max() > 1e-9 or np.linalg.det(turn) < 0:
+        raise ValueError("no rotation")
+    return pose

@@ -1,0 +1,207 @@
+"""One `Session` in one thread: poses and values in, frames out, the latest of each wins.
+
+What is slow to import is imported by the thread: the page is up before.
+"""
+
+import dataclasses
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jaxtrachea.viewer.frame import Frame
+
+Phase = Literal["reading", "compiling", "ready", "failed"]
+#: Steps that the curve keeps, and bytes of frames that a recording keeps.
+MOST_STEPS, MOST_BYTES = 20_000, 2**28
+
+
+class State(NamedTuple):
+    """Where the work stands; `text` says it to the user."""
+
+    phase: Phase
+    text: str
+
+
+class Live:
+    """A scene under a hand.
+
+    The thread reads and compiles, then answers poses and values one after the other. A pose that
+    another one follows before its turn is left out, so the picture never lags behind the hand.
+
+    Attributes:
+        path: of the scene file.
+        changed: called by the thread when there is a new frame or state.
+        state: where the work stands.
+        fault: the last error of a step; empty: none.
+        handled: the scene, once it is read.
+        sliders: of its parameters, likewise.
+        packet: the scene as bytes, likewise.
+        frame: the last one; None: none yet.
+        steps: the last steps, without their vertices.
+        recording: frames that are kept; None: nothing is recorded.
+    """
+
+    def __init__(self, path: Path, set_up: Callable[[], None] = lambda: None):
+        """Nothing is read yet.
+
+        Args:
+            path: of the scene file.
+            set_up: called by the thread before it reads.
+        """
+        self.path, self.set_up = path, set_up
+        self.changed: Callable[[], None] = lambda: None
+        self.state, self.fault = State("reading", f"reading {path.name}"), ""
+        self.handled: Any = None
+        self.sliders: list[Any] = []
+        self.packet = b""
+        self.frame: Frame | None = None
+        self.steps: list[Frame] = []
+        self.recording: list[Frame] | None = None
+        self._values: dict[str, float] = {}
+        self._pose: np.ndarray | None = None
+        self._last: np.ndarray | None = None
+        self._reset = self._ended = False
+        self._wake = threading.Condition()
+
+    def start(self) -> None:
+        """Begin in a thread of its own."""
+        threading.Thread(target=self.run, name="session", daemon=True).start()
+
+    def run(self) -> None:
+        """Read, compile, and answer until `end`; what fails is told in `state`."""
+        try:
+            session = self._prepare()
+        except (ValueError, OSError) as error:
+            self._tell("failed", str(error))
+            return
+        except (
+            Exception
+        ) as error:  # a fault of the program: the page says it, the terminal shows it
+            traceback.print_exc()
+            self._tell("failed", f"{type(error).__name__}: {error}; the terminal shows where")
+            return
+        while self._answer(session):
+            pass
+
+    def move(self, pose: np.ndarray) -> None:
+        """Move the tool: rotation by rows, then translation, mm; shape (12,)."""
+        with self._wake:
+            self._pose = pose
+            self._wake.notify()
+
+    def set_value(self, name: str, value: float) -> None:
+        """Go on with another value of a parameter, in its unit; nothing is compiled."""
+        with self._wake:
+            self._values[name] = value
+            self._pose = self._last if self._pose is None else self._pose
+            self._wake.notify()
+
+    def reset(self) -> None:
+        """Forget where the tool was, put it to the start, and take the values of the file."""
+        with self._wake:
+            self._reset = True
+            self._values = {s.name: s.value for s in self.sliders}
+            self._pose = self.start_pose
+            self._wake.notify()
+
+    def end(self) -> None:
+        """End the thread after its step."""
+        with self._wake:
+            self._ended = True
+            self._wake.notify()
+
+    @property
+    def start_pose(self) -> np.ndarray:
+        """Of the tool at the start; shape (12,)."""
+        assert self.handled is not None
+        return np.concatenate([self.handled.rotation.ravel(), self.handled.translation])
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Of all sliders, as they are now."""
+        return {s.name: s.value for s in self.sliders} | self._values
+
+    def _prepare(self) -> Any:
+        """The session."""
+        self.set_up()
+        from jaxtrachea.viewer.protocol import scene_packet
+        from jaxtrachea.viewer.scene import read_handled
+        from jaxtrachea.viewer.values import sliders
+
+        handled = read_handled(self.path, lambda text: self._tell("reading", text))
+        self.handled = handled
+        scene = handled.staged.scene
+        self.packet = scene_packet(scene, handled.title, self.start_pose)
+        self._tell("compiling", "compiling the scene")
+        session = handled.session()
+        self.sliders = sliders(session.material, scene.plan)
+        # The first step also loads what runs at the first step only.
+        self.frame = self._step(session, self.start_pose)
+        session.reset()
+        self._pose = self.start_pose
+        self._tell("ready", "ready")
+        return session
+
+    def _tell(self, phase: Phase, text: str) -> None:
+        self.state = State(phase, text)
+        self.changed()
+
+    def _answer(self, session: Any) -> bool:
+        """One step; whether to go on."""
+        with self._wake:
+            self._wake.wait_for(lambda: self._pose is not None or self._ended)
+            if self._ended or self._pose is None:
+                return False
+            pose, self._pose = self._pose, None
+            values, reset, self._reset = dict(self._values), self._reset, False
+        try:
+            if reset:
+                session.reset()
+            self._set(session, values)
+            frame = self._step(session, pose)
+        except Exception as error:  # the page says it; the next pose may do
+            traceback.print_exc()
+            self.fault = f"{type(error).__name__}: {error}"
+            self.changed()
+            return True
+        self.frame, self.fault, self._last = frame, "", pose
+        self.steps.append(frame.light)
+        del self.steps[:-MOST_STEPS]
+        self._record(frame)
+        self.changed()
+        return True
+
+    def _set(self, session: Any, values: dict[str, float]) -> None:
+        """Other values of the material, where they are others."""
+        import jax
+
+        now = session.material
+        new = {
+            name: jax.device_put(np.asarray(value, getattr(now, name).dtype))
+            for name, value in values.items()
+            if float(getattr(now, name)) != value
+        }
+        if new:
+            session.set_material(dataclasses.replace(now, **new))
+
+    def _step(self, session: Any, pose: np.ndarray) -> Frame:
+        from jaxtrachea.viewer.protocol import frame_of
+
+        begin = time.perf_counter()
+        result = session.step(pose[:9].reshape(3, 3), pose[9:])
+        seconds = time.perf_counter() - begin
+        return frame_of(session.scene.tool, pose, result, seconds)
+
+    def _record(self, frame: Frame) -> None:
+        if self.recording is None:
+            return
+        self.recording.append(frame)
+        size = 0 if frame.vertices is None else frame.vertices.nbytes
+        if size * len(self.recording) > MOST_BYTES:
+            self.fault = "the recording is full: the first half of its frames is thinned out"
+            self.recording[:] = self.recording[::2]

@@ -1,0 +1,181 @@
+"""A recording as one page that plays by itself: no server, nothing from outside."""
+
+import base64
+import hashlib
+import html
+import importlib.metadata
+import importlib.util
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea._errors import InputError
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.scene.results import SCHEMA, SCHEMA_VERSION
+from jaxtrachea.scene.stage import Scene
+from jaxtrachea.viewer.frame import Frame, packet, statuses
+from jaxtrachea.viewer.protocol import frame_of, rings_on, tube_arrays, tube_of
+
+HERE = Path(__file__).parent
+#: Bytes of displacements in a page at most; of a longer recording some rows are left out, evenly.
+MOST_BYTES = 2**26
+#: Series of a simulation that a page shows.
+SHOWN = ("status", "frame", "force", "gap", "phi", "vertices", "displacement")
+#: Largest number of an int16.
+TOP = 32767
+
+
+class PlayError(InputError):
+    """A recording that cannot be played, and why."""
+
+
+def of_frames(scene: Scene, title: str, frames: Sequence[Frame]) -> str:
+    """The page of frames that were recorded.
+
+    Args:
+        scene: that they are of.
+        title: of the page.
+        frames: in order; those without vertices are shown by their status.
+
+    Raises:
+        PlayError: no frame has vertices, or three.js is not installed.
+    """
+    assert scene.tool is not None
+    arrays = tube_arrays(*tube_of(scene), scene.tool)
+    return _page(title, arrays, frames)
+
+
+def of_file(path: Path, title: str = "") -> str:
+    """The page of a `simulation.h5`.
+
+    Args:
+        path: of the file.
+        title: of the page; empty: the name of the file.
+
+    Raises:
+        PlayError: no such file, none of a simulation, one of another version, or without a surface.
+    """
+    import h5py
+
+    try:
+        file = h5py.File(path, "r")
+    except OSError:
+        raise PlayError(
+            "no HDF5 file can be read here; name a simulation.h5", place=str(path)
+        ) from None
+    with file:
+        _check(path, file)
+        series = {name: np.asarray(data) for name, data in file["series"].items()}  # pyright: ignore
+        rest = {name: np.asarray(data) for name, data in file["rest"].items()}  # pyright: ignore
+        rings = {name: np.asarray(data) for name, data in file["rings"].items()}  # pyright: ignore
+        tool, poses = _tool(file, len(series["status"]))
+    where = rings_on(rest["s"], rest["phi"], rest["distance"], rings)
+    arrays = tube_arrays(rest["vertices"], rest["faces"], *where, tool)
+    frames = []
+    for i, pose in enumerate(poses):
+        row = {name: series[name][i] if name in series else None for name in SHOWN}
+        if tool is None:
+            turn = (rest["phi"] - series["phi"][i] + np.pi) % (2 * np.pi) - np.pi
+            near = np.hypot(rest["s"] - series["s"][i], rest["distance"] * turn).argmin()
+            pose = np.concatenate([np.eye(3).ravel(), series["vertices"][i, near]])
+        frames.append(frame_of(tool, np.nan_to_num(pose), SimpleNamespace(**row), 0.0))
+    return _page(title or path.stem, arrays, frames, place=str(path))
+
+
+def _check(path: Path, file) -> None:
+    place = str(path)
+    if file.attrs.get("schema") != SCHEMA:
+        raise PlayError("not a simulation", place=place, cure="name a simulation.h5")
+    version = file.attrs.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise PlayError(
+            f"is of version {version}", place=place, expected=str(SCHEMA_VERSION),
+            cure="simulate the scene again with this version of jaxtrachea",
+        )  # fmt: skip
+    if "rest" not in file or "vertices" not in file["series"]:
+        raise PlayError(
+            "has no surface", place=place, cure="simulate with surface = true in [output]"
+        )
+
+
+def _tool(file, rows: int) -> tuple[Shape | None, np.ndarray]:
+    """The tool, and its pose in every row; none of presses at given points."""
+    if "tool" not in file:
+        return None, np.zeros((rows, 12))
+    tool = {name: np.asarray(data) for name, data in file["tool"].items()}
+    turns = tool["rotation"].reshape(rows, 9)
+    shape = Shape(jnp.asarray(tool["vertices"]), jnp.asarray(tool["radius"]))
+    return shape, np.concatenate([turns, tool["translation"]], axis=1)
+
+
+def _page(
+    title: str, arrays: dict[str, np.ndarray], frames: Sequence[Frame], place: str = ""
+) -> str:
+    rest = arrays["rest"]
+    solved = [f for f in frames if f.vertices is not None]
+    if not solved:
+        raise PlayError("no row has a surface: nothing to play", place=place)
+    most = max(MOST_BYTES // (6 * len(rest)), 2)
+    rows = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), most)).round().astype(int))
+    kept = [frames[i] for i in rows]
+    moves = np.stack([0 * rest if f.vertices is None else f.vertices - rest for f in kept])
+    step = float(abs(moves).max()) / TOP or 1.0
+    arrays = arrays | {
+        "heads": np.stack([f.head for f in kept]),
+        "poses": np.stack([f.pose for f in kept]).astype(np.float32),
+        "moves": np.round(moves / step).astype(np.int16),
+    }
+    text = {"title": title, "pose": kept[0].pose.tolist(), "statuses": statuses(), "step": step,
+            "rows": (rows + 1).tolist(), "of": len(frames)}  # fmt: skip
+    return _html(title, packet(text, arrays))
+
+
+def _html(title: str, data: bytes) -> str:
+    three, notice = three_js()
+    imports = {"three-bundle": _address(three), "core": _address((HERE / "core.js").read_bytes())}
+    script = (HERE / "play.js").read_text()
+    modules = json.dumps({"imports": imports})
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+        for text in (modules, script)
+    )
+    policy = (
+        f"default-src 'none'; script-src {hashes} data:; style-src 'unsafe-inline'; "
+        "img-src data: blob:; media-src blob:"
+    )
+    fields = {
+        "@POLICY@": policy, "@TITLE@": html.escape(title), "@NOTICE@": notice.replace("--", "- -"),
+        "@PACKET@": base64.b64encode(data).decode(), "@MAP@": modules, "@SCRIPT@": script,
+    }  # fmt: skip
+    page = (HERE / "play.html.in").read_text()
+    for name, value in fields.items():
+        page = page.replace(name, value, 1)
+    return page
+
+
+def _address(script: bytes) -> str:
+    return f"data:text/javascript;base64,{base64.b64encode(script).decode()}"
+
+
+def three_js() -> tuple[bytes, str]:
+    """three.js as the extra `viewer` brings it, and its notice.
+
+    Raises:
+        PlayError: the extra is not installed.
+    """
+    found = importlib.util.find_spec("nicegui")
+    if found is None or not found.submodule_search_locations:
+        raise PlayError(
+            "play.html needs the extra 'viewer'", cure="pip install 'jaxtrachea[viewer]'"
+        )
+    folder = Path(found.submodule_search_locations[0])
+    script = (folder / "elements" / "scene" / "dist" / "index.js").read_bytes()
+    begin = script[: script.index(b"*/")].decode()
+    own = " ".join(line.strip(" */") for line in begin.splitlines() if "opyright" in line)
+    files = importlib.metadata.files("nicegui") or []
+    terms = next((f.read_text() for f in files if f.name == "LICENSE"), "MIT")
+    return script, f"This page holds three.js. {own}.\nAs bundled by NiceGUI:\n\n{terms}"

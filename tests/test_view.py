@@ -1,0 +1,454 @@
+"""The page: a scene under the mouse in a real browser, who may ask the server, recordings.
+
+Truth: `simulate` of the same pose; the network log of the browser; the rules of RFC 6454 (origins).
+"""
+
+import asyncio
+import contextlib
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+pytest.importorskip("nicegui", reason="the extra 'viewer' is not installed")
+from browser import CHROMIUM, Browser
+from run_cli import run
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.status import PressStatus
+from jaxtrachea.viewer.frame import LONGEST, Frame, read_pose
+from jaxtrachea.viewer.play import PlayError, of_file
+from jaxtrachea.viewer.scene import for_a_mouse
+from jaxtrachea.viewer.values import Slider, with_values
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+SCENE = """title = "a <short> tube"
+[trachea]
+length = "60 mm"
+rings = { count = 4, first = "12 mm", last = "48 mm" }
+around = 24
+along = 31
+[material]
+EI_L = "1.862 N mm^2"
+EA_L = "3.9 N"
+k_M = "0.1 N/mm"
+k_1 = "0.3 N/mm"    # of the wall
+k_3 = "0.02 N/mm^3"
+[tool]
+shape = "sphere"
+radius = "5 mm"
+[[path]]
+start = ["30 mm", "18 mm", "0 mm"]
+end = ["30 mm", "16 mm", "0 mm"]
+steps = 4
+"""
+#: Positions of the tool: pressed on and off the midline, clear, behind the ends of the rings.
+PLACES = np.array([[30.0, 16.2, 0.0], [21.0, 14.0, 9.0], [30.0, 25.0, 0.0], [30.0, -15.0, 0.0]])
+FORCE = "document.querySelector('[data-role=force]').innerText"
+DETAIL = "document.querySelector('[data-role=detail]').innerText"
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("view") / "short.toml"
+    path.write_text(SCENE)
+    return path
+
+
+@pytest.fixture(scope="module")
+def simulated(server):
+    """Series of `simulate` of the places; with `contact_point` per_step each row is by itself."""
+    with h5py.File(server.simulation) as file:
+        return {name: data[()] for name, data in file["series"].items()}
+
+
+class Server:
+    """`jaxtrachea view` in a process of its own; `lines`: what it has printed."""
+
+    def __init__(self, scene):
+        """Start it, and wait for its address."""
+        script = Path(__file__).parent / "reference" / "serve_page.py"
+        self.simulation = scene.with_name("simulation.h5")
+        np.save(scene.with_name("places.npy"), PLACES)
+        files = scene, scene.with_name("places.npy"), self.simulation
+        command = [sys.executable, str(script), *map(str, files)]
+        env = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"}
+        self.lines = []
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        end = time.monotonic() + 400
+        while not (found := self._address()):
+            assert time.monotonic() < end, self.lines
+            time.sleep(0.05)
+        self.address, self.port, self.token = found.group(0), int(found[1]), found[2]
+
+    def _read(self):
+        for line in self.process.stdout:
+            self.lines.append(line)
+
+    def end(self):
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(30)
+        self._reader.join()
+        self.process.stdout.close()
+
+    def _address(self):
+        return re.search(r"http://127\.0\.0\.1:(\d+)/\?token=(\S+)", "".join(self.lines))
+
+    @property
+    def compiled(self):
+        return self.lines.count("compiled\n")
+
+    def get(self, path, **heads):
+        """Status and headers of a request."""
+        heads = {"Host": f"127.0.0.1:{self.port}", **heads}
+        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        link.putrequest("GET", path, skip_host=True)
+        for name, value in heads.items():
+            if value is not None:
+                link.putheader(name.replace("_", "-"), value)
+        link.endheaders()
+        with contextlib.closing(link), link.getresponse() as answer:
+            return answer.status, answer.read(), dict(answer.getheaders())
+
+    def socket(self, path="/frames", origin="own", token=None):
+        own = f"http://127.0.0.1:{self.port}"
+        mark = "&" if "?" in path else "?"
+        token = self.token if token is None else token
+        return connect(
+            f"ws://127.0.0.1:{self.port}{path}{mark}token={token}", proxy=None,
+            origin=own if origin == "own" else origin, compression=None, ping_interval=None,
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def server(scene_file):
+    made = Server(scene_file)
+    yield made
+    made.end()
+
+
+@pytest.fixture(scope="module")
+def browser(server):
+    """On the page; `first` is what it says at once."""
+    made = Browser()
+    try:
+        made.go(server.address)
+        made.first = made.wait("document.querySelector('#status')?.innerText")
+        made.wait("window.trachea?.last", 240)
+        yield made
+    finally:
+        made.close()
+
+
+def place(browser, at):
+    """Put the tool there; force and detail of the frame of that pose."""
+    before = browser.run("trachea.stats.frames")
+    browser.run(f"trachea.place({', '.join(map(str, at))})")
+    browser.wait(f"trachea.stats.frames > {before}")
+    return browser.run(FORCE), browser.run(DETAIL)
+
+
+def changes(browser, act):
+    """The label of the force before and after."""
+    before = browser.run(FORCE)
+    act()
+    browser.wait(f"{FORCE} !== {json.dumps(before)}")
+    return before, browser.run(FORCE)
+
+
+@needs_browser
+def test_the_page_is_there_before_the_scene(browser):
+    assert re.match("reading|compiling", browser.first)
+    assert browser.run("location.search") == ""  # the token does not stay in the address
+
+
+@needs_browser
+def test_a_drag_a_key_and_a_click_change_the_force(browser):
+    assert browser.run(FORCE) == "no contact"
+    x, y = browser.run("trachea.screen()")
+    _, pressed = changes(browser, lambda: browser.drag((x, y), (x, y + 30)))
+    assert re.fullmatch(r"F \d\.\d{4} N", pressed)
+    assert browser.run("trachea.pose()[10]") < 18
+    changes(browser, lambda: browser.key("ArrowDown"))
+    at = browser.run("trachea.pose()[9]")
+    browser.key("ArrowRight", shift=True)
+    assert browser.run("trachea.pose()[9]") == pytest.approx(at + 0.05)
+    browser.key("KeyE")
+    assert browser.run("trachea.pose()[5]") == pytest.approx(-np.sin(np.pi / 36))
+    x, y = browser.run("trachea.screen()")
+    changes(browser, lambda: browser.drag((x + 90, y + 60), (x + 90, y + 60), steps=1))
+    assert not browser.errors
+
+
+@needs_browser
+def test_the_label_is_that_of_simulate(browser, simulated):
+    for at, force in zip(PLACES[:2], simulated["force"], strict=False):
+        assert place(browser, at)[0] == f"F {np.linalg.norm(force):.4f} N"
+
+
+@needs_browser
+def test_where_there_is_no_force_the_page_says_why_and_keeps_the_surface(browser, simulated):
+    assert place(browser, PLACES[2]) == ("no contact", "the tool does not touch")
+    place(browser, PLACES[0])
+    force, detail = place(browser, PLACES[3])
+    status = PressStatus(int(simulated["status"][3]))
+    assert status == PressStatus.BEHIND_GAP
+    assert force == "no force"
+    assert detail == f"{status.message} (grey: the last surface)"
+    assert browser.run("trachea.finite()")
+
+
+@needs_browser
+def test_a_slider_changes_the_force_and_compiles_nothing(browser, server):
+    shown = browser.run("[...document.querySelectorAll('[id^=value-]')].map((e) => e.id)")
+    assert shown == [f"value-{name}" for name in ("EI_L", "k_M", "k_1", "k_3", "EA_L")]
+    place(browser, PLACES[0])
+    before = server.compiled
+    box = browser.run("document.querySelector('#value-k_M').getBoundingClientRect().toJSON()")
+    at = box["x"] + 0.8 * box["width"], box["y"] + box["height"] / 2
+
+    def click():
+        browser.mouse("mousePressed", *at)
+        browser.mouse("mouseReleased", *at, buttons=0)
+
+    changes(browser, click)
+    browser.run("document.querySelector('#reset').click()")
+    browser.wait(f"{FORCE} === 'no contact'")
+    assert server.compiled == before > 0
+
+
+@needs_browser
+def test_no_request_leaves_this_machine(browser, server):
+    addresses = [a for a in browser.requests if not a.startswith(("data:", "blob:"))]
+    assert len(addresses) > 10
+    assert {a.split("/")[2] for a in addresses} == {f"127.0.0.1:{server.port}"}
+    assert not browser.errors  # nothing broke the Content-Security-Policy
+
+
+def test_only_the_page_itself_is_answered(server):
+    good = f"/?token={server.token}"
+    status, page, heads = server.get(good)
+    policy = heads["content-security-policy"]
+    assert status == 200
+    assert b"<script>" not in page  # each has the nonce of the policy
+    assert "default-src 'none'" in policy
+    assert "'unsafe-inline'" not in policy.split("style-src")[0]
+    cookie = heads["set-cookie"].split(";")[0]
+    assert {"HttpOnly", "SameSite=Strict"} < set(heads["set-cookie"].split("; "))
+    own = f"http://127.0.0.1:{server.port}"
+    assert server.get("/core.js", Cookie=cookie, Origin=own)[0] == 200
+    for path, given in [
+        ("/", {}), ("/?token=", {}), (f"{good}x", {}), (good[:-1], {}), ("/core.js", {}),
+        ("/scene.bin", {"Cookie": cookie[:-1]}), (good, {"Host": "evil.example"}),
+        (good, {"Host": f"evil.example:{server.port}"}), (good, {"Host": None}),
+        (good, {"Origin": "http://evil.example"}), (good, {"Origin": "null"}),
+        (good, {"Origin": "http://127.0.0.1:1"}),
+        ("/core.js", {"Cookie": cookie, "Sec_Fetch_Site": "same-site"}),
+    ]:  # fmt: skip
+        assert server.get(path, **given)[0] == 403, (path, given)
+    for path in ("/../../etc/passwd", "/page.py", "/..%2fpage.py", "/docs", "/openapi.json"):
+        assert server.get(path, Cookie=cookie)[0] == 404, path
+    assert server.get("/_nicegui/3.18.0/static/..%2f..%2fapp.py", Cookie=cookie)[0] == 404
+
+
+def test_it_listens_on_loopback_alone(server):
+    rows = Path("/proc/net/tcp").read_text().split("\n") if sys.platform == "linux" else []
+    found = [r.split()[1] for r in rows[1:] if r and r.split()[3] == "0A"]
+    mine = [a for a in found if int(a.split(":")[1], 16) == server.port]
+    if not mine:
+        pytest.skip("no list of sockets")
+    assert mine == [f"0100007F:{server.port:04X}"]
+
+
+NICEGUI = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+
+
+@pytest.mark.parametrize("path", ["/frames", NICEGUI])
+def test_both_sockets_refuse_strangers(server, path):
+    with server.socket(path) as link:
+        assert link.recv(timeout=60)
+    for given in (
+        {"origin": "http://evil.example"}, {"origin": None}, {"origin": "http://127.0.0.1:1"},
+        {"token": "x"}, {"token": f"{server.token}x"},
+    ):  # fmt: skip
+        with pytest.raises(InvalidStatus) as refused, server.socket(path, **given):
+            pass
+        assert refused.value.response.status_code == 403
+    mark = "&" if "?" in path else "?"
+    asked = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13",
+             "Sec_WebSocket_Key": "AAAAAAAAAAAAAAAAAAAAAA==", "Host": "evil.example",
+             "Origin": "http://evil.example"}  # fmt: skip
+    assert server.get(f"{path}{mark}token={server.token}", **asked)[0] == 403
+
+
+#: Of the outside of the wall, mm.
+RADIUS = 12.6
+GOOD = [1, 0, 0, 0, 1, 0, 0, 0, 1, 30, 16, 0]
+
+
+def test_messages_that_are_none_close_the_socket(server):
+    bad = [
+        "x" * 2**20, "no JSON", '"other"', "[" * 4000, json.dumps({"pose": GOOD[:11]}),
+        json.dumps({"pose": [*GOOD[:11], 1e300]}), json.dumps({"pose": [2, *GOOD[1:]]}),
+        '{"pose": [1, 0, 0, 0, 1, 0, 0, 0, 1, 30, 16, NaN]}', json.dumps({"pose": GOOD, "more": 1}),
+        json.dumps({"pose": [True, *GOOD[1:]]}), b"\0" * 40,
+    ]  # fmt: skip
+    for message in bad:
+        with server.socket() as link:
+            link.recv(timeout=60)
+            link.send(message)
+            with pytest.raises(ConnectionClosed):
+                link.recv(timeout=60)
+    with server.socket() as link:  # and the server is well
+        assert len(link.recv(timeout=60)) > 40
+
+
+def test_dragged_about_the_wall_no_row_needs_another_plan(server):
+    """5 x 5 x 5: along, round (all the rings) and into the wall."""
+    found = []
+    with server.socket() as link:
+        link.recv(timeout=60)
+        for s in np.linspace(8, 52, 5):
+            for phi in np.linspace(-1.9, 1.9, 5):
+                for gap in (1.0, -0.5, -1.0, -2.0, -3.0):
+                    off = RADIUS + 5 + gap
+                    pose = [*GOOD[:9], s, off * np.cos(phi), off * np.sin(phi)]
+                    link.send('"drawn"')
+                    link.send(json.dumps({"pose": pose}))
+                    head = np.frombuffer(link.recv(timeout=60)[:40], np.float32)
+                    assert np.isfinite(head).all()
+                    found.append(PressStatus(int(head[0])))
+    assert len(found) == 125
+    assert PressStatus.OFF_PLAN not in found
+    assert found.count(PressStatus.OK) >= 75
+
+
+@needs_browser
+def test_a_second_page_takes_over_and_the_first_says_so(browser, server):
+    with server.socket() as link:
+        link.recv(timeout=60)
+        browser.wait("/another page/.test(document.querySelector('#status').innerText)")
+
+
+@needs_browser
+def test_a_recording_plays_from_disk(browser, server, simulated, tmp_path):
+    page = tmp_path / "play.html"
+    page.write_text(of_file(server.simulation, "a <b>title</b>"))
+    assert "Three.js Authors" in page.read_text()
+    assert "Permission is hereby granted" in page.read_text()
+    del browser.requests[:]
+    browser.go(page.as_uri())
+    browser.wait("location.protocol === 'file:' && window.trachea?.last")
+    assert browser.run("document.title") == "a <b>title</b>"
+    assert browser.run(FORCE) == f"F {np.linalg.norm(simulated['force'][0]):.4f} N"
+    step = browser.run("trachea.deviation")  # largest |u| over 32767, halved by rounding
+    moved = browser.run("Array.from(trachea.positions())")
+    truth = simulated["vertices"][0].ravel()
+    assert abs(np.array(moved) - truth).max() <= 0.5 * step + 1e-5
+    browser.run("document.getElementById('play').click()")
+    browser.wait("document.getElementById('row').value === '3'")
+    assert browser.run(FORCE) == "no force"
+    browser.run("document.getElementById('play').click()")
+    assert not browser.errors
+    assert not [a for a in browser.requests if not a.startswith(("file:", "data:", "blob:"))]
+
+
+def test_a_recording_of_another_version_is_refused(server, tmp_path):
+    file = Path(shutil.copy(server.simulation, tmp_path))
+    with h5py.File(file, "r+") as changed:
+        changed.attrs["schema_version"] = 1
+    with pytest.raises(PlayError, match="version 1; expected 2; simulate the scene again"):
+        of_file(file)
+    file.write_text("none")
+    with pytest.raises(PlayError, match="no HDF5 file"):
+        of_file(file)
+
+
+def test_bad_input_ends_the_command(server, scene_file, tmp_path, monkeypatch, capsys):
+    taken = run(monkeypatch, capsys, "view", scene_file, "--port", server.port)
+    assert taken[0] == 2
+    assert f"--port: {server.port} cannot be used" in taken[2]
+    none = run(monkeypatch, capsys, "view", tmp_path / "none.toml")
+    assert none[0] == 2
+    assert "there is no such file" in none[2]
+    none = run(monkeypatch, capsys, "play", tmp_path / "none.h5")
+    assert none[0] == 2
+    assert "name a simulation.h5" in none[2]
+
+
+def test_a_scene_without_a_tool_gets_a_finger(scene_file):
+    text = scene_file.read_text()
+    press = '[path]\ns = "30 mm"\ndisplacement = ["0 mm", "-2 mm", "0 mm"]\n'
+    bare = scene_file.with_name("press.toml")
+    bare.write_text(text[: text.index("[tool]")] + '[model]\ncontact = "bonded"\n' + press)
+    spec, notes = for_a_mouse(load_scene_spec(bare))
+    assert spec.tool.shape == "capsule"
+    assert spec.model.contact == "unilateral"  # a finger is not glued on
+    assert spec.effects.second_plane == spec.effects.axial == "on"
+    assert len(notes) == 1
+
+
+def test_a_slider_is_logarithmic_about_a_positive_value():
+    k = Slider("k_M", "N/mm", "", 0.1, 0.01, 1.0, log=True)
+    assert k.at(k.share) == pytest.approx(0.1)
+    assert k.at(0.0) == pytest.approx(0.01)
+    assert k.at(1.0) == pytest.approx(1.0)
+
+
+def test_values_go_back_into_the_file():
+    new = with_values(SCENE, {"k_1": 0.4567891, "EI_L": 2.0})
+    assert 'k_1 = "0.456789 N/mm"    # of the wall' in new
+    assert new.replace("0.456789", "0.3").replace('"2 N', '"1.862 N') == SCENE
+    with pytest.raises(ValueError, match="k_M: not on a line"):
+        with_values('[material]\n"k_M" = "1 N/mm"', {"k_M": 2.0})
+
+
+def test_a_pose_is_read_whole_or_not_at_all():
+    assert read_pose(json.dumps({"pose": GOOD})).tolist() == GOOD
+    assert read_pose('"drawn"') is None
+    with pytest.raises(ValueError, match="too long"):
+        read_pose(" " * (LONGEST + 1))
+
+
+def test_a_frame_without_a_solution_has_no_numbers():
+    none = np.zeros(3)
+    frame = Frame(PressStatus.OFF_TUBE, np.zeros(12), none, 0.0, none, 0.0, None)
+    assert len(frame.pack()) == 40
+    assert not frame.has_force
+
+
+def test_the_event_loop_is_left_alone_by_a_thread():
+    """What the thread calls when no page has come does nothing."""
+    from jaxtrachea.viewer.live import Live
+    from jaxtrachea.viewer.server import Frames
+
+    async def make():
+        return Frames(Live(Path("none.toml")))
+
+    asyncio.run(make()).changed()
+
+
+def test_what_cannot_be_read_is_said(tmp_path):
+    from jaxtrachea.viewer.live import Live
+
+    live = Live(tmp_path / "none.toml")
+    live.run()
+    assert live.state.phase == "failed"
+    assert "none.toml" in live.state.text
