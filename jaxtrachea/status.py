@@ -58,7 +58,7 @@ class PressStatus(_Described):
         "factors were found: forces up to 30 % off; fit them to presses of this tube",
     )
     BACK_IN_TIME = 15, "the time is before that of an earlier sample, or no number"
-    LIFTED = 16, "another tool holds the wall away from this one: no force"
+    LIFTED = 16, "solved, without a force: another tool holds the wall away from this one"
     NOT_CONVERGED = 17, "the contacts are not in balance: too stiff for these digits; use float64"
 
     @property

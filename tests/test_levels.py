@@ -151,7 +151,7 @@ def test_a_level_relaxes_around_any_other(options):
     assert level.needs(joints=True) == off.needs(joints=True) | set(names)
     assert set(in_model(options, joints=True, named=DECLARED)) == level.needs(joints=True)
     assert level.observes == off.observes
-    assert not level.stepwise
+    assert level.stepwise == off.stepwise
     assert level.closed == off.closed
     assert "no time" in str(level.admits(curve(), SIZE))
     assert level.admits(curve(time=np.arange(6.0)), SIZE) is None

@@ -27,11 +27,11 @@ from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.measurements.record_zeros import FEW, SHOWN, TOLD_APART
+from jaxtrachea.measurements.record_zeros import LEAST_NOISE, SHOWN, TOLD_APART
 
-#: z^2 from which a zero is asked for: three standard errors, by chance in 0.3 % of the curves. Less
-#: than a record must show (`record_zeros.EVIDENCE`): no shape of the press is looked for here.
-ASKED = 9.0
+#: Probability by which chance asks for a zero, on each side: three standard errors of many samples.
+#: Less than a record must show (`record_zeros.EVIDENCE`): no shape of the press is looked for here.
+CHANCE = 0.00135
 #: Zeros that are looked for.
 ZEROS = ("onset", "force_offset")
 #: Differences for derivatives, relative to the size of an unknown or of the press.
@@ -245,7 +245,7 @@ def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
         now = [*chosen, best]
         step = np.linalg.solve(gram[np.ix_(now, now)], slope[now])
         unit, _ = _unit(result, lane, r - step @ left[now], len(now))
-        if not fall[best] / unit > ASKED * (1 + FEW / int(result.samples[lane])):
+        if not fall[best] > _asked(result, lane, len(now)) * unit:
             break
         twins = [
             k for k, (_, t) in enumerate(places)
@@ -284,6 +284,22 @@ def _possible(result: FitResult, lane: int, places, value) -> Bool[np.ndarray, "
     return out
 
 
+def _asked(result: FitResult, lane: int, taken: int) -> float:
+    """z^2 from which a zero is asked for; infinite with no sample left to judge it by."""
+    from scipy.special import stdtrit  # only those whose fits may ask wait for it
+
+    left = _left(result, lane, taken)
+    if left < 1:
+        return np.inf
+    return float(stdtrit(np.inf if result.study.noise_known[lane] else left, 1 - CHANCE)) ** 2
+
+
+def _left(result: FitResult, lane: int, taken: int) -> int:
+    """Samples beyond the unknowns, zeros that were taken among them."""
+    free = int(np.sum(result.study.lanes.active[lane] > 0))
+    return int(result.samples[lane]) - free - taken
+
+
 def _unit(result: FitResult, lane: int, r: Float[np.ndarray, " m"], taken: int):
     """Fall of the sum of squares that counts as one variance of independent noise.
 
@@ -291,10 +307,12 @@ def _unit(result: FitResult, lane: int, r: Float[np.ndarray, " m"], taken: int):
     """
     study = result.study
     precision = study.lanes.precision[lane]
-    left = int(result.samples[lane]) - int(np.sum(study.lanes.active[lane] > 0)) - taken
-    variance = float(r @ r) / max(left, 1)
+    variance = float(r @ r) / max(_left(result, lane, taken), 1)
     if study.noise_known[lane]:
         variance = max(variance, 1.0)
+    # Residuals that are rounding ask for nothing: no model of a press is meant to be closer.
+    peak = float(np.max(np.where(precision > 0, np.abs(study.lanes.force[lane]), 0)))
+    variance = max(variance, (LEAST_NOISE * peak / max(float(result.sigma[lane, 0]), 1e-300)) ** 2)
     force = r.reshape(len(precision), -1)[:, : precision.shape[1]]
     force = np.where(precision > 0, force, np.nan)[None]
     pairs = np.sum(np.isfinite(force[..., 1:]) & np.isfinite(force[..., :-1]), axis=(1, 2))

@@ -252,7 +252,7 @@ def too_deep_for_uniform(
     """
     if options.relaxation != "uniform" or options.coupling != "series":
         return None
-    softens = options.skeleton == "softening"
+    softens = "e_1" in level_of(options).needs(joints=False)
     errors = _ERRORS["softening" if softens else "others"]
     found = []
     for c, at in zip(curves, [0.0] * len(curves) if touch is None else touch, strict=True):

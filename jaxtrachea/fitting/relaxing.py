@@ -222,8 +222,9 @@ def parts_press(
 
     def branches(free) -> tuple[Branches, Branches]:
         found = _relaxation(model, values_of(model, free, value))
-        assert found.skeleton is not None
-        return found.local, found.skeleton
+        local, skeleton = found.local, found.skeleton
+        assert skeleton is not None
+        return local, skeleton
 
     def push(tangent):
         return jax.jvp(branches, (free,), (tangent,))

@@ -37,7 +37,7 @@ _RISING, _ROUNDING = 6.0, 1e-5
 #: Share of the record that a line needs, and of the mean stiffness that it has at most.
 _LONG, _FLAT = 0.04, 0.2
 #: Noise at least, share of the largest force: no model of a press is meant to be closer.
-_LEAST_NOISE = 5e-4
+LEAST_NOISE = 5e-4
 #: Part of the air before the corner that is left out of its mean and line.
 _MARGIN = 0.15
 #: Part of the record, and samples at least, that must run through the origin.
@@ -150,7 +150,7 @@ def _of_equal_length(D, F, given) -> Zeros:
     usable = (span > 0) & (peak > 0)
     span, peak = np.where(usable, span, 1.0), np.where(usable, peak, 1.0)
     measured = np.where(np.isnan(given), _noise(D, F), given)
-    noise = np.maximum(measured, _LEAST_NOISE * peak)
+    noise = np.maximum(measured, LEAST_NOISE * peak)
     ends = np.linspace(0, D.shape[1], min(D.shape[1], _MEANS) + 1).astype(int)
     held = np.diff(ends)
     x, y = (np.add.reduceat(v, ends[:-1], axis=1) / held for v in (D, F))
