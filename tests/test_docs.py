@@ -289,8 +289,9 @@ def test_check_of_the_page_runs(monkeypatch, capsys):
 def test_page_on_predictions_runs(tmp_path):
     """Its three commands, then its Python: a folder of results and what it predicts."""
     (tmp_path / "fits").symlink_to(ROOT / "fits")
-    lines = re.findall(r"^    jaxtrachea (.*)$", (DOCS / "after_a_fit.md").read_text(), re.M)
-    code = "import jaxtrachea\n" + blocks(DOCS / "predict.md", "python")[0]
+    section = (DOCS / "after_a_fit.md").read_text().split("\n## ")[1]
+    lines = re.findall(r"^    jaxtrachea (.*)$", section, re.M)
+    code = "import jaxtrachea\n" + blocks(DOCS / "after_a_fit.md", "python")[0]
     calls = [["-m", "jaxtrachea", *shlex.split(line)] for line in lines]
     for call in [*calls, ["-c", code]]:
         done = subprocess.run([sys.executable, *call], capture_output=True, text=True, cwd=tmp_path)
