@@ -87,7 +87,7 @@ def simulated(s):
 def stepped(s):
     path = poses(s)
     here = path.rotation[0], path.translation[0]
-    state = step._start(scene())
+    state = step._start(scene(), None)
     _, found, press = step.move_tool(scene(), MATERIAL, state, *here)
     return found.force, surface(scene(), *press), found.joints
 

@@ -17,6 +17,7 @@ Where these are still correlated, the model misses the curve and a zero is not w
 import dataclasses
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -217,7 +218,8 @@ def _weights(result: FitResult, lanes: Int[np.ndarray, " n"], value) -> np.ndarr
     weight = np.asarray(study.lanes.balance)[lanes][..., None] * scale[:, None]
     if study.model.loss == "linear":
         return weight
-    _, slope = robust(study.model.loss, (value * scale[:, None]) ** 2, study.model.loss_scale)
+    size = jnp.asarray((value * scale[:, None]) ** 2)
+    _, slope = robust(study.model.loss, size, study.model.loss_scale)
     return weight * np.sqrt(np.asarray(slope))
 
 
