@@ -210,7 +210,7 @@ def friction(v: Values) -> Answer:
 
 
 def in_time(v: Values) -> Answer:
-    """`press_in_time`: two branches, one ring, L = 100 mm; the status is that of the last sample."""
+    """`press_in_time`: two branches, one ring, L = 100 mm; status of the last sample."""
     geometry = _tube(1, 100.0, v["D"].dtype)
     material = Material(v["EI_L"], v["k_M"], v["k_1"], v["k_3"])
     motion = Motion(jnp.asarray(50.0, v["D"].dtype), v["D"], time=v["time"])

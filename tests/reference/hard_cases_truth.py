@@ -443,7 +443,7 @@ def overload(v, elastic):
 
 @functools.cache
 def kept(t_0, t_1, end, tau):
-    """At the time `end`, of what a branch gets evenly from t_0 to t_1; at once where they are one."""
+    """Share at the time `end` of what a branch gets evenly from t_0 to t_1 (equal: at once)."""
     x = (t_1 - t_0) / tau
     return mp.exp(-(end - t_1) / tau) * (-mp.expm1(-x) / x if x != 0 else 1)
 
