@@ -121,7 +121,7 @@ def test_scene_runs(scene, monkeypatch, capsys):
         level = {row[0]: row[1] for row in json.loads(file.attrs["plan"])}
         assert SHOWS[scene.stem].items() <= level.items()
         force, status = file["series/force"][:], file["series/status"][:]
-        assert file["series/force"].attrs["unit"] == "N"
+        assert file["series/force"].attrs["units"] == "N"
     assert np.isfinite(force).all()
     table = pd.read_csv(result / "forces.csv")
     np.testing.assert_array_equal(table[[f"force_{axis}_N" for axis in "xyz"]], force)

@@ -61,7 +61,7 @@ WITHIN = {
         {"step"},
         {"session"},
         {"build", "results"},
-        {"cost", "plots", "solids"},
+        {"cost", "plots", "read", "solids"},
         {"surface_plot"},
     ],
     "measurements": [

@@ -51,22 +51,37 @@ def write_simulation(
         for name, value in out._asdict().items():
             if value is not None:
                 data = series.create_dataset(name, data=np.asarray(value), compression="gzip")
-                data.attrs["unit"] = UNITS.get(name, "mm")
+                data.attrs["units"] = UNITS.get(name, "mm")
+                _name_dimensions(series, data)
         series["status"].attrs["meaning"] = json.dumps({int(s): s.message for s in PressStatus})
         if isinstance(motion, Poses):
             tool = file.create_group("tool")
-            tool.create_dataset("translation", data=motion.translation).attrs["unit"] = "mm"
-            tool.create_dataset("rotation", data=motion.rotation).attrs["unit"] = "1"
+            tool.create_dataset("translation", data=motion.translation).attrs["units"] = "mm"
+            tool.create_dataset("rotation", data=motion.rotation).attrs["units"] = "1"
             if scene.tool is not None:
-                tool.create_dataset("vertices", data=scene.tool.vertices).attrs["unit"] = "mm"
-                tool.create_dataset("radius", data=scene.tool.radius).attrs["unit"] = "mm"
+                tool.create_dataset("vertices", data=scene.tool.vertices).attrs["units"] = "mm"
+                tool.create_dataset("radius", data=scene.tool.radius).attrs["units"] = "mm"
         _write_rings(file.create_group("rings"), scene)
         _write_material(file.create_group("material"), material)
         if scene.mesh is not None:
             rest = file.create_group("rest")
             for name in ("vertices", "faces", "s", "phi", "distance"):
                 data = rest.create_dataset(name, data=getattr(scene.mesh, name))
-                data.attrs["unit"] = {"faces": "1", "phi": "rad"}.get(name, "mm")
+                data.attrs["units"] = {"faces": "1", "phi": "rad"}.get(name, "mm")
+
+
+def _name_dimensions(series: h5py.Group, data: h5py.Dataset) -> None:
+    """Dimension scales as netCDF-4 has them, without values: xarray reads the names."""
+    middle = "vertex" if data.name == "/series/vertices" else "ring"
+    if data.name in ("/series/frame", "/series/stiffness"):
+        names = "row", "xyz", "column"
+    else:
+        names = ("row", "xyz") if data.ndim == 2 else ("row", middle, "xyz")
+    for axis, (name, size) in enumerate(zip(names, data.shape, strict=False)):
+        if name not in series:
+            scale = series.create_dataset(name, shape=(size,), dtype=">f4")
+            scale.make_scale(f"This is a netCDF dimension but not a netCDF variable.{size:10d}")
+        data.dims[axis].attach_scale(series[name])
 
 
 def _write_rings(group: h5py.Group, scene: Scene) -> None:
@@ -76,7 +91,7 @@ def _write_rings(group: h5py.Group, scene: Scene) -> None:
         ("position", tube.ring_positions, "mm"), ("height", tube.ring_height, "mm"),
         ("radius", tube.radius, "mm"), ("half_angle", tube.half_angle, "rad"),
     ):  # fmt: skip
-        group.create_dataset(name, data=value).attrs["unit"] = unit
+        group.create_dataset(name, data=value).attrs["units"] = unit
 
 
 def _write_material(group: h5py.Group, material: AnyMaterial) -> None:
@@ -84,7 +99,7 @@ def _write_material(group: h5py.Group, material: AnyMaterial) -> None:
     declared = VALUES | SECTION_VALUES
     for name, value in vars(material).items():
         if value is not None and name in declared:
-            group.create_dataset(name, data=value).attrs["unit"] = declared[name].unit
+            group.create_dataset(name, data=value).attrs["units"] = declared[name].unit
 
 
 def write_forces(path: Path, out: Simulation) -> None:
@@ -114,12 +129,12 @@ def write_sweep(path: Path, scene: Scene, s, phi, depth: float, out: Sweep, made
              "status": "1"}  # fmt: skip
     with hdf5_file(path) as file:
         _head(file, made, scene.plan)
-        file.create_dataset("s", data=s).attrs["unit"] = "mm"
-        file.create_dataset("phi", data=phi).attrs["unit"] = "rad"
-        file.create_dataset("depth", data=depth).attrs["unit"] = "mm"
+        file.create_dataset("s", data=s).attrs["units"] = "mm"
+        file.create_dataset("phi", data=phi).attrs["units"] = "rad"
+        file.create_dataset("depth", data=depth).attrs["units"] = "mm"
         for name, value in out._asdict().items():
             grid = np.asarray(value).reshape(len(s), len(phi))
-            file.create_dataset(name, data=grid, compression="gzip").attrs["unit"] = units[name]
+            file.create_dataset(name, data=grid, compression="gzip").attrs["units"] = units[name]
         file["status"].attrs["meaning"] = json.dumps({int(v): v.message for v in PressStatus})
 
 

@@ -18,11 +18,15 @@ from jaxtrachea.mechanics.beam import Beam, deflect
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, ring_weight
 from jaxtrachea.mechanics.friction import Coulomb, slide
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
 from jaxtrachea.mechanics.press import Contact, Options, compliance, press
 from jaxtrachea.mechanics.press import respond as touch_and_respond
+from jaxtrachea.mechanics.press_in_time import press_in_time
 from jaxtrachea.mechanics.ring import Ring, respond, ring_compliance
 from jaxtrachea.mechanics.vector_equilibrium import press_vector
+from jaxtrachea.relaxation.filter import Relaxation
+from jaxtrachea.relaxation.steps import Branches
 from jaxtrachea.surface.local import correction, fit
 from jaxtrachea.surface.regions import Binding, Keys, clamped, interpolate, weigh
 from jaxtrachea.trachea.geometry import Geometry
@@ -205,11 +209,22 @@ def friction(v: Values) -> Answer:
     return {"force": got.force, "slip": got.slip}, got.status
 
 
+def in_time(v: Values) -> Answer:
+    """`press_in_time`: two branches, one ring, L = 100 mm; status of the last sample."""
+    geometry = _tube(1, 100.0, v["D"].dtype)
+    material = Material(v["EI_L"], v["k_M"], v["k_1"], v["k_3"])
+    motion = Motion(jnp.asarray(50.0, v["D"].dtype), v["D"], time=v["time"])
+    relaxation = Relaxation(Branches(v["gamma"], v["tau"]))
+    options = Options(relaxation="uniform", branches="prony-2")
+    got = press_in_time(geometry, material, motion, relaxation, options)
+    return {"force": got.force, "depth": got.depth}, got.status[-1]
+
+
 FUNCTIONS: dict[str, Callable[[Values], Answer]] = {
     f.__name__: f
     for f in (
         series, quintic, total, first_touch, vector, press_9, press_1, compliance_200, beam,
         beam_shear, beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape,
-        on_ring_weight, friction,
+        on_ring_weight, friction, in_time,
     )
 }  # fmt: skip

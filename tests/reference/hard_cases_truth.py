@@ -8,6 +8,7 @@ Derivatives are central differences with a step of 1e-35 in 260 digits; the two 
 agree, so that a kink is noticed (`one_sided` rows take three points on their side).
 """
 
+import functools
 import json
 import sys
 
@@ -23,16 +24,21 @@ mp.mp.dps = beam_fem.DIGITS = spatial_fem.DIGITS = 260
 KEPT = 25
 
 
-def cubic(D, c, k_1, k_3):
-    """Root of (1 + c k_1) d + c k_3 d^3 = D on the branch through 0; trigonometric closed forms."""
-    delta = D / (1 + c * k_1)
-    u = mp.mpf(27) / 4 * c * k_3 / (1 + c * k_1) * delta**2
+def cubic_root(a, b, D):
+    """Root of a d + b d^3 = D on the branch through 0; trigonometric closed forms."""
+    delta = D / a
+    u = mp.mpf(27) / 4 * b / a * delta**2
     if u == 0:
         return delta
     r = mp.sqrt(abs(u))
     if u > 0:
         return delta * 3 / r * mp.sinh(mp.asinh(r) / 3)
     return delta * 3 / r * mp.sin(mp.asin(r) / 3)
+
+
+def cubic(D, c, k_1, k_3):
+    """Root of d + c (k_1 d + k_3 d^3) = D."""
+    return cubic_root(1 + c * k_1, c * k_3, D)
 
 
 def series(v):
@@ -424,12 +430,60 @@ def friction(v):
     return {"force": [N, *(v["mu"] * N * p for p in u)], "slip": slip}
 
 
+def overload(v, elastic):
+    """The branches at the last time: the superposition integral of ramps and jumps."""
+    time = v["time"][: len(elastic)]
+    end, total = time[-1], v["gamma"][0] * 0
+    before = list(zip([time[0], *time], [mp.mpf(0), *elastic], strict=False))
+    for (t_0, e_0), t_1, e_1 in zip(before, time, elastic, strict=False):
+        for gamma, tau in zip(v["gamma"], v["tau"], strict=True):
+            total += gamma * (e_1 - e_0) * kept(t_0, t_1, end, tau)
+    return total
+
+
+@functools.cache
+def kept(t_0, t_1, end, tau):
+    """Share at the time `end` of what a branch gets evenly from t_0 to t_1 (equal: at once)."""
+    x = (t_1 - t_0) / tau
+    return mp.exp(-(end - t_1) / tau) * (-mp.expm1(-x) / x if x != 0 else 1)
+
+
+@functools.cache
+def touched(D, c, k_1, k_3):
+    """Elastic force and depth."""
+    got = first_touch({"D": D, "c": c, "k_1": k_1, "k_3": k_3, "onset": mp.mpf(0)})
+    return got["force"], got["depth"]
+
+
+@functools.cache
+def one_ring(EI_L, k_M):
+    """Compliance in the middle of 100 mm, where the ring is."""
+    return beam_fem.solve([50.0], 100.0, [EI_L] * 2, [k_M], 50.0, ONE).w_C
+
+
+def in_time(v):
+    """Elastic presses, then the integral; where it would pull, the surface at which F = 0."""
+    c = one_ring(v["EI_L"], v["k_M"])
+    elastic, force, depth = [], [], []
+    for D in v["D"]:
+        e, d = touched(D, c, v["k_1"], v["k_3"])
+        F = e + overload(v, [*elastic, e])
+        if F < 0:
+            rest = overload(v, [*elastic, mp.mpf(0)])
+            e = -rest / (1 + overload(v, [*elastic, ONE]) - rest)
+            F, d = mp.mpf(0), cubic_root(v["k_1"], v["k_3"], e)
+        elastic.append(e)
+        force.append(F)
+        depth.append(d)
+    return {"force": force, "depth": depth}
+
+
 MODELS = {
     f.__name__: f
     for f in (
         series, quintic, total, first_touch, vector, press_9, press_1, compliance_200, beam,
         beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight,
-        friction,
+        friction, in_time,
     )
 } | {"beam_shear": beam}  # fmt: skip
 
