@@ -132,7 +132,7 @@ class Session:
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
 
     def step(
-        self, rotation: ArrayLike, translation: ArrayLike, dt: float | None = None
+        self, rotation: ArrayLike, translation: ArrayLike, dt: ArrayLike | None = None
     ) -> Simulation:
         """Move the tool.
 
