@@ -43,7 +43,8 @@ def quantity(dimension: str, *, positive: bool = False, words: tuple[str, ...] =
         except UnitError as error:
             raise ValueError(", or ".join([str(error), *map(repr, words)])) from None
         if positive and number <= 0:
-            raise ValueError(f"expected a positive {dimension}")
+            kind = "number" if dimension == "dimensionless" else dimension.replace("_", " ")
+            raise ValueError(f"expected a positive {kind}")
         return number
 
     return BeforeValidator(read)

@@ -347,6 +347,16 @@ def test_a_law_that_softens_is_followed_to_its_peak():
     np.testing.assert_allclose(off, 0, atol=1e-5)  # the rounded corner
 
 
+def test_float32_arguments_on_a_float64_tube():
+    """As `press`: the tube's precision, for rounded places and displacements."""
+    s, D = np.float32([60.0, 90.0]), np.float32([[2.0, 3.0]])
+    tube, material = table_1(), Material(**VALUES)
+    # Shapes alone: the loop of the solve was refused, which is found without compiling it.
+    with jax.numpy_dtype_promotion("standard"):  # users' default
+        given = jax.eval_shape(lambda: press_contacts(tube, material, s, D))
+    assert given.force.dtype == given.compliance.dtype == np.float64
+
+
 def test_too_many_and_what_does_not_fit():
     tube, material = table_1(), Material(**VALUES)
     for arguments, says in [

@@ -237,6 +237,13 @@ def test_usage_is_told():
     )
     assert said[-1] == "the same curve under 2 names: T01 a, T01 b"
     assert sentences([plain]) == []
+    timed = dataclasses.replace(raw_curve(held, held, "d"), time=np.arange(held.size) / 10)
+    relaxed = finish(timed, ReadOptions())
+    twice = dataclasses.replace(
+        relaxed,
+        usage=dataclasses.replace(relaxed.usage, remarks=("a hold of 1 s", "a hold of 2 s")),
+    )
+    assert "holds in 1 of 1 curves (T01 d: a hold of 1 s): T01 d" in sentences([twice])
     lines = usage_lines(curves)
     assert lines[0] == "T01 a: 200 of 300 samples, 0 … 4 of 0 … 4 mm"
     assert lines[2] == "  left out: holds 100"

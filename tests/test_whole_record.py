@@ -112,6 +112,29 @@ def test_time_that_is_none_is_refused(changes, message):
     assert 'loading = "' in done.cure
 
 
+UNUSABLE = {
+    "no unit": ("time", 2.0, "unit_missing", "column 'time' has no unit"),
+    "a gap": ("time [s]", np.nan, "non_finite", "time is empty, NaN or infinite in line 42"),
+}
+
+
+@pytest.mark.parametrize(("head", "entry", "kind", "message"), UNUSABLE.values(), ids=UNUSABLE)
+@pytest.mark.parametrize("tidy", [True, False])
+def test_a_column_of_time_that_cannot_be_used_is_refused_by_name(
+    tmp_path, tidy, head, entry, kind, message
+):
+    """It is there: the cure is a unit, or a sample less, not another column."""
+    raw = record()
+    table = np.stack([raw.time, raw.displacement, raw.force], axis=1)[::10]
+    table[40, 0] = entry if np.isnan(entry) else table[40, 0]
+    first = "specimen,trial," if tidy else ""
+    rows = [f"{first}{head},displacement [mm],force [N]"]
+    rows += [f"{'T,a,' if tidy else ''}{t:.9g},{d:.9g},{f:.9g}" for t, d, f in table]
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    (bad,) = read_measurements([tmp_path / "a.csv"], dataclasses.replace(WHOLE, s="35 mm")).bad
+    assert (bad.kind, message in bad.message) == (kind, True)
+
+
 @pytest.mark.parametrize("again", [True, False])
 def test_two_records_of_one_trial_with_clocks_of_their_own_are_refused(tmp_path, again):
     """A trial of its own for each is the cure, and then both are read; one sample is a mistake."""

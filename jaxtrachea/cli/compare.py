@@ -98,15 +98,17 @@ def _check_leave_out(loaded, names, leave_out) -> None:
     from jaxtrachea.inference.repeats import repeats
 
     lacks = {
-        "speeds": "no specimen has records of two speeds with their time, or a stiffness belongs "
-        "to single curves",
+        "speeds": "no specimen has curves of two speeds with their time, fitted together (curves "
+        "of one specimen share its name, from data.specimen or a column; no stiffness has the "
+        'scope "trial")',
         "holds": 'no curve is a whole record with its time (loading = "record") that goes on after '
         "its loading",
     }
     for (_, _, study), name in zip(loaded, names, strict=True):
         if leave_out in lacks and not len(repeats(study, leave_out).lanes):
             raise Stop(
-                f"compare: --leave-out {leave_out}: {name}: {lacks[leave_out]}; leave it out"
+                f"compare: --leave-out {leave_out}: {name}: {lacks[leave_out]}; "
+                "use --leave-out positions"
             )
 
 

@@ -117,8 +117,9 @@ def _remarked(curves: Sequence[Curve]) -> Iterator[str]:
         hits = [(c, remark) for c, remark in seen if word in remark]
         if hits:
             names = _listed([c for c, _ in hits])
+            count = len({id(c) for c, _ in hits})  # one curve may have several remarks
             first = f"{hits[0][0].specimen} {hits[0][0].trial}: {hits[0][1]}"
-            yield f"{topic} in {len(hits)} of {len(curves)} curves ({first}): {names}"
+            yield f"{topic} in {count} of {len(curves)} curves ({first}): {names}"
 
 
 def same_curves(curves: Sequence[Curve]) -> Iterator[str]:

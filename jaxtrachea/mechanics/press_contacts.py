@@ -140,6 +140,9 @@ def _press_contacts(
     beam = ligament_beam(geometry, material, options)
     unit = influence(beam, s_c) if half == 0 else level_influence(beam, s_c, half)
     law = jax.vmap(lambda s: local_law(geometry, material, s, options))(s_c)
+    # The loop of `solve` keeps its dtype: float32 arguments meet a float64 tube here.
+    dtype = jnp.result_type(displacement, unit.compliance, *jax.tree.leaves(law))
+    displacement = displacement.astype(dtype)
     width = None
     if options.contact == "unilateral":
         width = jnp.asarray(options.onset_width, displacement.dtype)

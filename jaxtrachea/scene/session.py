@@ -132,7 +132,7 @@ class Session:
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
 
     def step(
-        self, rotation: ArrayLike, translation: ArrayLike, dt: float | None = None
+        self, rotation: ArrayLike, translation: ArrayLike, dt: ArrayLike | None = None
     ) -> Simulation:
         """Move the tool.
 
@@ -150,7 +150,7 @@ class Session:
 
         Raises:
             ValueError: another shape, or a matrix that is no rotation; no dt where the force
-                relaxes; the state stays as it was.
+                relaxes, or one that is not one number; the state stays as it was.
         """
         begin = time.perf_counter()
         turn, place = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
@@ -164,6 +164,8 @@ class Session:
         if self._timed:
             if dt is None:
                 raise ValueError(NO_TIME)
+            if not isinstance(dt, float) and (np.ndim(dt) or isinstance(dt, str)):
+                raise ValueError(f"dt is {dt!r}; expected one number, s, as in 0.001")
             pose = turn, place, np.asarray(dt, self.dtype)
         with self._lock:
             # Two arrays: to make one of them takes longer than it saves.

@@ -215,6 +215,9 @@ def test_a_session_is_the_scan(material, relaxation):
         row = session.step(*given)
         np.testing.assert_allclose(row.force, found.force[i], atol=1e-12)
         assert row.status == found.status[i]
+    for dt in ("1 s", np.zeros(2)):
+        with pytest.raises(ValueError, match="dt is .* expected one number, s"):
+            session.step(*given[:2], dt)
     again = pickle.loads(pickle.dumps(session))
     assert np.array_equal(again.step(*given).force, session.step(*given).force)
 

@@ -337,7 +337,8 @@ class Table:
         """Time of some rows, s: of `columns.time`, else of the only column named so, if usable.
 
         Raises:
-            Fault: the column named in the options has no unit or holds text.
+            Fault: the column named in the options, or the one that a whole record needs, has no
+                unit or holds text.
         """
         column = time_column(self.names, self.header.units, roles, options)
         if column is None:
@@ -345,7 +346,7 @@ class Table:
         i, unit = column
         if not self.is_read(i) and (clock := seconds(self.cells(i)[rows])) is not None:
             return clock - clock[0]
-        if "time" in roles:
+        if "time" in roles or options.loading == "record":
             unit = resolve_unit("time", unit, options, f"column {self.names[i]!r}")
             return self.values("time", i, rows, unit)
         if unit is None:
