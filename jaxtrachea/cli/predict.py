@@ -115,7 +115,7 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
         say_lost(lost)
         text = without_lost(report.report_at(stored, digest, curves), lost)
         write_text(folder / "report.md", text)
-    _show("Predictions, at the deepest displacement", report.at_table(curves))
+    _show("Predictions, at the deepest displacement, of a hold at its end", report.at_table(curves))
     _end(report.outcomes(curves), folder.parent)
     return 0 if all(p.status.predicts for p in curves) else 1
 

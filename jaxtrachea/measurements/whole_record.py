@@ -18,8 +18,8 @@ from jaxtrachea.measurements.usage import RELAXED
 ELASTIC = 'or fit one loading without its time (loading = "last")'
 #: Share of the samples that may have the time of the one before.
 MOST_AT_ONCE = 0.5
-#: Speeds of a ramp that are plausible, mm/s.
-SPEEDS = 1e-3, 1e3
+#: Speeds of a ramp that are plausible, mm/s; 1 mm/s with its ms read as s is below.
+SPEEDS = 1.1e-3, 1e3
 #: Share of the largest force that a record may begin with where no rest shows its zero.
 FIRST_FORCE = 0.05
 #: Of the loading, within which the tool rests at the beginning.

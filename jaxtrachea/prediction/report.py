@@ -65,8 +65,9 @@ def error_table(rows: Sequence[Row], of: str = "curve") -> Table:
 
 
 def at_table(curves: Sequence[CurvePrediction]) -> Table:
-    """Every curve at its deepest displacement, for people."""
-    deepest = [int(np.argmax(np.abs(p.displacement))) for p in curves]
+    """Every curve at its deepest displacement, of a hold at its end, for people."""
+    depth = [np.abs(p.displacement) for p in curves]
+    deepest = [int(np.flatnonzero(d == d.max())[-1]) for d in depth]
     rows = [list(band_rows(p, [i]))[0] for p, i in zip(curves, deepest, strict=True)]
     return Table(rows, DEEPEST).first(MANY, "and {} more, see bands.csv")
 
@@ -107,7 +108,7 @@ def report_at(stored: FitResult, digest: str, curves: Sequence[CurvePrediction])
         "# Predictions",
         _origin(stored, digest),
         "\n".join(f"- {line}." for line in outcomes(curves)),
-        "## At the deepest displacement of each curve",
+        "## At the deepest displacement of each curve, of a hold at its end",
         _table(at_table(curves)),
         BANDS,
         "![predictions](predictions.png)",

@@ -5,6 +5,7 @@ The records are of a body without a skeleton, in closed form.
 
 import csv
 import dataclasses
+import re
 import sys
 
 import numpy as np
@@ -145,6 +146,9 @@ def test_a_speed_and_a_hold_on_the_command_line(fitted, monkeypatch, capsys):
     truth = force_at(time, corners, way)
     assert np.all((low < truth) & (truth < high))
     assert truth[-1] < 0.7 * force.max()
+    (line,) = (v for v in (out / "report.md").read_text().splitlines() if v.startswith("| T "))
+    shown = [float(v) for v in re.findall(r"[\d.]+", line)]
+    assert any(v == pytest.approx(force[-1], rel=5e-3) for v in shown)  # not that of the ramp's end
 
 
 def test_records_of_other_speeds_are_compared_by_their_own_time(fitted, monkeypatch, capsys):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -217,7 +217,7 @@ def draw_energy(found: list[Curves]):
     return figure
 
 
-def _draw(axis, at, band: Band, beyond, label: str) -> str:
+def _draw(axis, at, band: Band, beyond, label: str) -> Any:
     """A line, dotted where it is extrapolated, with its band; returns the colour."""
     order = np.argsort(at)
     at, beyond = np.asarray(at)[order], np.asarray(beyond)[order]
