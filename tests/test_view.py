@@ -157,19 +157,30 @@ def browser(server):
         made.close()
 
 
+def settled(browser):
+    """Number of frames drawn, once none has come for a while: frames of earlier poses are late."""
+    frames = -1
+    while frames != (frames := browser.run("trachea.stats.frames")):
+        time.sleep(0.4)
+    return frames
+
+
 def place(browser, at):
     """Put the tool there; force and detail of the frame of that pose."""
-    before = browser.run("trachea.stats.frames")
+    before = settled(browser)
     browser.run(f"trachea.place({', '.join(map(str, at))})")
     browser.wait(f"trachea.stats.frames > {before}")
+    settled(browser)
     return browser.run(FORCE), browser.run(DETAIL)
 
 
 def changes(browser, act):
     """The label of the force before and after."""
+    settled(browser)
     before = browser.run(FORCE)
     act()
     browser.wait(f"{FORCE} !== {json.dumps(before)}")
+    settled(browser)
     return before, browser.run(FORCE)
 
 
