@@ -123,11 +123,13 @@ def pytest_runtest_setup(item):
 
 #: Files that take longest begin, so that none runs on alone at the end.
 LONGEST = (
+    "test_view.py",
     "test_step.py",
     "test_contracts.py",
     "test_press_in_time.py",
     "test_rub.py",
     "test_in_time.py",
+    "test_relaxing.py",
     "test_relaxation.py",
     "test_damaged.py",
     "test_fits.py",
