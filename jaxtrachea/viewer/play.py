@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.scene.results import SCHEMA, SCHEMA_VERSION
+from jaxtrachea.scene.read import SimulationFileError, read_simulation
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.viewer.frame import Frame, packet, statuses
 from jaxtrachea.viewer.protocol import frame_of, rings_on, tube_arrays, tube_of
@@ -59,57 +57,31 @@ def of_file(path: Path, title: str = "") -> str:
     Raises:
         PlayError: no such file, none of a simulation, one of another version, or without a surface.
     """
-    import h5py
-
     try:
-        file = h5py.File(path, "r")
-    except OSError:
+        stored = read_simulation(path)
+    except SimulationFileError as error:
+        raise PlayError.like(error) from None
+    series, rest, tool = stored.simulation, stored.rest, stored.tool
+    if rest is None or series.vertices is None:
         raise PlayError(
-            "no HDF5 file can be read here; name a simulation.h5", place=str(path)
-        ) from None
-    with file:
-        _check(path, file)
-        series = {name: np.asarray(data) for name, data in file["series"].items()}  # pyright: ignore
-        rest = {name: np.asarray(data) for name, data in file["rest"].items()}  # pyright: ignore
-        rings = {name: np.asarray(data) for name, data in file["rings"].items()}  # pyright: ignore
-        tool, poses = _tool(file, len(series["status"]))
-    where = rings_on(rest["s"], rest["phi"], rest["distance"], rings)
+            "has no surface", place=str(path), cure="simulate with surface = true in [output]"
+        )
+    poses = np.zeros((len(series.status), 12))
+    if stored.path is not None:
+        poses[:, :9] = np.asarray(stored.path.rotation).reshape(-1, 9)
+        poses[:, 9:] = stored.path.translation
+    where = rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)
     arrays = tube_arrays(rest["vertices"], rest["faces"], *where, tool)
     frames = []
     for i, pose in enumerate(poses):
-        row = {name: series[name][i] if name in series else None for name in SHOWN}
+        given = {name: getattr(series, name) for name in SHOWN}
+        row = {name: None if v is None else v[i] for name, v in given.items()}
         if tool is None:
-            turn = (rest["phi"] - series["phi"][i] + np.pi) % (2 * np.pi) - np.pi
-            near = np.hypot(rest["s"] - series["s"][i], rest["distance"] * turn).argmin()
-            pose = np.concatenate([np.eye(3).ravel(), series["vertices"][i, near]])
+            turn = (rest["phi"] - series.phi[i] + np.pi) % (2 * np.pi) - np.pi
+            near = np.hypot(rest["s"] - series.s[i], rest["distance"] * turn).argmin()
+            pose = np.concatenate([np.eye(3).ravel(), series.vertices[i, near]])
         frames.append(frame_of(tool, np.nan_to_num(pose), SimpleNamespace(**row), 0.0))
     return _page(title or path.stem, arrays, frames, place=str(path))
-
-
-def _check(path: Path, file) -> None:
-    place = str(path)
-    if file.attrs.get("schema") != SCHEMA:
-        raise PlayError("not a simulation", place=place, cure="name a simulation.h5")
-    version = file.attrs.get("schema_version")
-    if version != SCHEMA_VERSION:
-        raise PlayError(
-            f"is of version {version}", place=place, expected=str(SCHEMA_VERSION),
-            cure="simulate the scene again with this version of jaxtrachea",
-        )  # fmt: skip
-    if "rest" not in file or "vertices" not in file["series"]:
-        raise PlayError(
-            "has no surface", place=place, cure="simulate with surface = true in [output]"
-        )
-
-
-def _tool(file, rows: int) -> tuple[Shape | None, np.ndarray]:
-    """The tool, and its pose in every row; none of presses at given points."""
-    if "tool" not in file:
-        return None, np.zeros((rows, 12))
-    tool = {name: np.asarray(data) for name, data in file["tool"].items()}
-    turns = tool["rotation"].reshape(rows, 9)
-    shape = Shape(jnp.asarray(tool["vertices"]), jnp.asarray(tool["radius"]))
-    return shape, np.concatenate([turns, tool["translation"]], axis=1)
 
 
 def _page(
