@@ -195,7 +195,7 @@ def _alike(elastic, depth, law: Law, way, status, options: Options, samples: Sam
         way: displacement under an elastic force, mm.
         status: of the elastic press.
         options: static.
-        samples: -
+        samples: times and history.
     """
     unilateral, branches = options.contact == "unilateral", samples.relaxation.local
 

@@ -79,9 +79,7 @@ class Live:
         except (ValueError, OSError) as error:
             self._tell("failed", str(error))
             return
-        except (
-            Exception
-        ) as error:  # a fault of the program: the page says it, the terminal shows it
+        except Exception as error:  # of the program: the page says it, the terminal shows where
             traceback.print_exc()
             self._tell("failed", f"{type(error).__name__}: {error}; the terminal shows where")
             return
