@@ -110,14 +110,15 @@ def _damping(radius: float, along, values) -> float:
     top = max(values[-1], 1e-300)
     values = np.maximum(values, 0)
 
-    def length(damping):
-        return norm(along / (values + np.exp(damping)))
+    def too_long(damping):  # both sides times the damping: no quotient is beyond float64
+        added = np.exp(damping)
+        return norm(along / (values / added + 1)) > radius * added
 
     low, high = np.log(_SINGULAR * top), np.log(top + norm(along) / radius)
-    if length(low) > radius:
+    if too_long(low):
         for _ in range(60):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if length(middle) > radius else (low, middle)
+            low, high = (middle, high) if too_long(middle) else (low, middle)
         low = high
     return float(np.exp(low))
 

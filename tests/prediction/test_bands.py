@@ -21,6 +21,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction.core import Estimate, predicted
@@ -155,7 +156,9 @@ def test_linear_model_has_the_bands_of_the_text_book(given, tmp_path):
     The trials differ by 2 %: residuals are alike, and errors are longer by the growth for it.
     """
     curves = list(pairs())
-    read = stored_again(total_study(curves, noise=Noise(force=given)), tmp_path / "r.h5")
+    no_zeros = dict.fromkeys(("onset", "force_offset"), {"auto": False})
+    study = total_study(curves, no_zeros, noise=Noise(force=given))
+    read = stored_again(study, tmp_path / "r.h5")
     D, F = (np.concatenate([getattr(c, n) for c in curves[:2]]) for n in ("displacement", "force"))
     X = np.stack([D, D**3], axis=1)
     beta, rss, *_ = np.linalg.lstsq(X, F, rcond=None)
@@ -202,7 +205,8 @@ def test_core_in_float32(read):
     estimate = Estimate(*(jnp.asarray(v, np.float32) for v in rows))
     place, depth = np.full(3, 61.0, np.float32), np.tile(np.float32([1.0, 4.0]), (3, 1))
     program = functools.partial(predicted, read.study.model)
-    batch = jax.jit(jax.vmap(program))(estimate, jnp.asarray(place), jnp.asarray(depth))
+    motion = Motion(jnp.asarray(place), jnp.asarray(depth))
+    batch = jax.jit(jax.vmap(program))(estimate, motion)
     assert batch.value.force.dtype == batch.se.joints.dtype == np.float32
     exact = predict_sources(read, sources, [61.0] * 3, [np.array([1.0, 4.0])] * 3)
     for k, curve in enumerate(exact):
