@@ -473,8 +473,8 @@ def test_help_lists_the_commands_in_the_order_of_use(monkeypatch, capsys):
     assert code == 0
     lines = out.partition("Commands:\n")[2].rstrip().splitlines()
     assert [line.split()[0] for line in lines] == [
-        "check", "init", "fit", "predict", "design", "compare", "convert", "plan", "simulate",
-        "sweep", "view", "play", "tradeoff", "selfcheck", "cache",
+        "demo", "check", "init", "fit", "predict", "design", "compare", "convert", "plan",
+        "simulate", "sweep", "view", "play", "tradeoff", "selfcheck", "cache",
     ]  # fmt: skip
 
 

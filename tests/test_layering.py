@@ -142,7 +142,8 @@ WITHIN = {
     "cli": [{"terminal_table", "specification", "options", "beside"}, {"terminal"},
             {"file_options", "fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"sources"}, {"written_spec"},
-            {"compare", "cache", "convert", "init", "predict", "tradeoff", "view"}, {"main"}],
+            {"compare", "cache", "convert", "demo", "init", "predict", "tradeoff", "view"},
+            {"main"}],
 }  # fmt: skip
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]

@@ -22,6 +22,7 @@ from jaxtrachea import __version__
 from jaxtrachea.cli import cache as cli_cache
 from jaxtrachea.cli import compare as cli_compare
 from jaxtrachea.cli import convert as cli_convert
+from jaxtrachea.cli import demo as cli_demo
 from jaxtrachea.cli import fit as cli_fit
 from jaxtrachea.cli import init as cli_init
 from jaxtrachea.cli import predict as cli_predict
@@ -46,13 +47,12 @@ from jaxtrachea.cli.terminal import (
 )
 
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help=(
         "Mechanics of the trachea: identify stiffnesses from force-displacement curves "
-        "(check, init, fit, predict, design, compare, convert); simulate a tool on a trachea "
+        "(demo, check, init, fit, predict, design, compare, convert); simulate a tool on a trachea "
         "(plan, simulate, sweep, view, play)."
     ),
 )
@@ -102,6 +102,20 @@ def _options(
     if version:
         typer.echo(__version__)
         raise typer.Exit
+
+
+@app.command()
+def demo(folder: cli_demo.FolderArgument = Path("jaxtrachea-demo")) -> None:
+    """Write an example into a new folder: curves, a fit of them, a scene."""
+    cli_demo.write_example(folder)
+    out = Console()
+    out.print(f"{folder}: curves of a finite-element trachea, a fit of them, a scene", markup=False)
+    try:
+        fit(spec=folder / "fit.toml", out_dir=folder / "fit")
+    except typer.Exit:
+        for line in cli_demo.next_steps(folder):
+            out.print(line, markup=False, highlight=False, soft_wrap=True)
+        raise
 
 
 @app.command()
