@@ -106,7 +106,7 @@ def _options(
 
 @app.command()
 def demo(folder: cli_demo.FolderArgument = Path("jaxtrachea-demo")) -> None:
-    """Write an example into a new folder: curves, a fit of them, a scene."""
+    """Write an example into a new folder and fit its curves."""
     cli_demo.write_example(folder)
     out = Console()
     out.print(f"{folder}: curves of a finite-element trachea, a fit of them, a scene", markup=False)
