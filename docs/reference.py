@@ -13,11 +13,13 @@ import re
 import textwrap
 import types
 from pathlib import Path
+from typing import get_args
 
 from pydantic import BaseModel
 
 from jaxtrachea import config
 from jaxtrachea.fitting.parameters import DECLARED
+from jaxtrachea.relaxation.words import Word
 from jaxtrachea.scene import spec
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.trachea.material import OF_PRESS
@@ -119,6 +121,7 @@ TYPES = {
     "Lengths3": ("three lengths", ""),
     "Sizes3": ("three lengths", ""),
     "Angles3": ("three angles", ""),
+    "Word": (", ".join(f"`{word}`" for word in get_args(Word)), ""),
     "str": ("text", ""),
     "bool": ("true or false", ""),
     "int": ("whole number", ""),

@@ -20,6 +20,7 @@ from pydantic import (
 
 from jaxtrachea.files.toml import EVEN, LISTED, load_spec
 from jaxtrachea.files.toml import SpecError as SpecError
+from jaxtrachea.relaxation.words import Word
 from jaxtrachea.units import UnitError, parse_quantity
 
 
@@ -254,7 +255,7 @@ class ModelSection(Section):
     """`uniform`: the force relaxes, all parts alike; `parts`: local contact and skeleton apart.
     Both read the time (`loading = "record"`)
     """
-    branches: Literal["prony-1", "prony-2", "prony-3", "prony-4", "power", "fung"] = "prony-2"
+    branches: Word = "prony-2"
     """law of the relaxation"""
 
     @model_validator(mode="before")

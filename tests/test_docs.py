@@ -247,7 +247,7 @@ def commands():
 
 def known_options():
     group = typer.main.get_command(app)
-    names = {"": {"--version", "--help"}}
+    names = {"": {"--help"}.union(*(option.opts for option in group.params))}
     for name, command in group.commands.items():
         names[name] = {"--help"}.union(
             *((*option.opts, *option.secondary_opts) for option in command.params)

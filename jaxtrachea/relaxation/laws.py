@@ -10,13 +10,14 @@ A law gives the reduced relaxation function G(t) of a sudden press, over what la
 - `fung`: g = C int exp(-t/tau) d log tau from tau_1 to tau_2 (a box of times), by 12 Gauss nodes:
   within 1e-4 of g(0) for times up to 1e4 apart.
 
-A new law is an entry of `LAWS`, and the declarations of its numbers in `trachea.material`.
+A new law is a word, an entry of `LAWS`, and the declarations of its numbers in
+`trachea.material`.
 """
 
 import functools
 import math
 from collections.abc import Callable, Mapping
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,11 +27,10 @@ from jaxtyping import Array, Float
 from jaxtrachea._arguments import check_word
 from jaxtrachea.relaxation.filter import Relaxation
 from jaxtrachea.relaxation.steps import Branches
+from jaxtrachea.relaxation.words import Word as Word
 
 #: What the name of a number ends in where it is the skeleton's.
 OF_SKELETON = "_skeleton"
-#: Words of the laws.
-Word = Literal["prony-1", "prony-2", "prony-3", "prony-4", "power", "fung"]
 #: Of `power`: nodes a decade, and decades beyond the span in which its nodes lie.
 PER_DECADE, BELOW, ABOVE = 2, 1.0, 2.0
 #: Nodes of `fung`.

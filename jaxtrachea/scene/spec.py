@@ -27,6 +27,7 @@ from jaxtrachea.mechanics.sections.material import (
     SectionMaterial,
 )
 from jaxtrachea.relaxation import laws
+from jaxtrachea.relaxation.words import Word
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.trachea.material import DEEP, OF_TIME, VALUES, meaningless
@@ -159,7 +160,7 @@ def _relaxation_keys() -> type[Section]:
 class RelaxationSection(_relaxation_keys()):
     """[relaxation]: how the force relaxes; see `jaxtrachea.relaxation.laws`."""
 
-    branches: Literal["prony-1", "prony-2", "prony-3", "prony-4", "power", "fung"] = "prony-2"
+    branches: Word = "prony-2"
     """law of the relaxation, as in a fit"""
 
     @model_validator(mode="after")
