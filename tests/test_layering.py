@@ -63,7 +63,8 @@ WITHIN = {
         {"session"},
         {"build", "results"},
         {"cost", "plots", "read", "solids"},
-        {"surface_plot"},
+        {"surface_plot", "recording"},
+        {"gltf", "vtk_files"},
     ],
     "measurements": [
         {"presses", "turning", "plausible", "first_touch", "observed", "press_shape"},

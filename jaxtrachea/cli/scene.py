@@ -104,6 +104,8 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
             motion = staged.material, staged.path
             write_simulation(folder / "simulation.h5", staged.scene, *motion, out, made)
             lost = _write_play(folder, title) if spec.output.play else {}
+            if spec.output.vtk or spec.output.animation:
+                _write_recording(folder, spec.output)
             _write_json(folder, made)
             say_lost(drawing.result() | lost)
     _print_rows(out)
@@ -303,6 +305,23 @@ def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, st
     if out.vertices is not None and row is not None:
         drawings["surface.png"] = partial(draw_surface, *shown, row, title)
     return save_each(folder, drawings)[1]
+
+
+def _write_recording(folder: Path, output) -> None:
+    """The simulation for other programs; nothing where no row was solved, which is said anyway."""
+    from jaxtrachea.scene.gltf import write_glb
+    from jaxtrachea.scene.read import read_simulation
+    from jaxtrachea.scene.recording import NoSurface, recording_of
+    from jaxtrachea.scene.vtk_files import write_vtk
+
+    try:
+        recording = recording_of(read_simulation(folder / "simulation.h5"))
+    except NoSurface:
+        return
+    if output.vtk:
+        write_vtk(folder, recording)
+    if output.animation:
+        write_glb(folder / "simulation.glb", recording)
 
 
 def _write_play(folder: Path, title: str) -> dict[str, str]:

@@ -1,10 +1,11 @@
-"""Triangles of a tool, its distance from points, and lines where a surface crosses a level.
+"""Triangles of a tool, its distance from points, rings on a wall, lines where it crosses a level.
 
 For pictures and mesh files: numpy, no derivative. Lengths in mm.
 """
 
 import contextlib
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -105,6 +106,23 @@ def tool_distance(shape: Shape, points: np.ndarray, count: int = 4000) -> np.nda
         ways = np.concatenate([ways, ConvexHull(corners.T).equations[:, :3]])
     reach = (ways @ corners).max(axis=1) + float(shape.radius)
     return np.max(points @ ways.T - reach, axis=1)
+
+
+def rings_on(s, phi, distance, rings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices that lie on a ring (bool), and the vertex of each ring on the anterior midline.
+
+    Args:
+        s: of the vertices along the centreline, mm.
+        phi: round it, rad.
+        distance: from it, mm.
+        rings: `position` of each and `height`, mm, and `half_angle`, rad.
+    """
+    s, phi, distance = (np.asarray(v, float) for v in (s, phi, distance))
+    away = np.abs(s[:, None] - np.asarray(rings["position"], float))
+    ring = (away.min(axis=1) <= float(rings["height"]) / 2) & (
+        abs(phi) <= float(rings["half_angle"])
+    )
+    return ring, np.hypot(away, (distance * phi)[:, None]).argmin(axis=0)
 
 
 def crossings(faces: np.ndarray, values: np.ndarray, level: float = 0.0) -> Crossings:

@@ -357,11 +357,16 @@ class OutputSection(Section):
     """series.png, surface.png"""
     play: bool = False
     """play.html: the simulation as a page that plays in any browser (extra `viewer`)"""
+    vtk: bool = False
+    """simulation.pvd: wall, tool and contact force in every row, for ParaView"""
+    animation: bool = False
+    """simulation.glb: the simulation as an animation for slides and 3-D viewers"""
 
     @model_validator(mode="after")
-    def _surface_to_play(self) -> "OutputSection":
-        if self.play and not self.surface:
-            raise ValueError("play needs surface = true; remove one")
+    def _surface_to_show(self) -> "OutputSection":
+        for name in ("play", "vtk", "animation"):
+            if getattr(self, name) and not self.surface:
+                raise ValueError(f"{name} needs surface = true; remove one")
         return self
 
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.scene.read import SimulationFileError, read_simulation
+from jaxtrachea.scene.solids import rings_on
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.viewer.frame import Frame, packet, statuses
-from jaxtrachea.viewer.protocol import frame_of, rings_on, tube_arrays, tube_of
+from jaxtrachea.viewer.protocol import frame_of, tube_arrays, tube_of
 
 HERE = Path(__file__).parent
 #: Bytes of displacements in a page at most; of a longer recording some rows are left out, evenly.

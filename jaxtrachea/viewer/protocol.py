@@ -1,11 +1,11 @@
 """The packet of a scene and the frame of a step, from the records of the model."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.scene.solids import rings_on
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.viewer.frame import Frame, packet, statuses
@@ -77,23 +77,6 @@ def tube_of(scene: Scene) -> tuple[Any, Any, np.ndarray, np.ndarray]:
              "half_angle": tube.half_angle}  # fmt: skip
     where = rings_on(mesh.s, mesh.phi, mesh.distance, rings)
     return mesh.vertices, mesh.faces, *where
-
-
-def rings_on(s, phi, distance, rings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices that lie on a ring (bool), and the vertex of each ring on the anterior midline.
-
-    Args:
-        s: of the vertices along the centreline, mm.
-        phi: round it, rad.
-        distance: from it, mm.
-        rings: `position` of each and `height`, mm, and `half_angle`, rad.
-    """
-    s, phi, distance = (np.asarray(v, float) for v in (s, phi, distance))
-    away = np.abs(s[:, None] - np.asarray(rings["position"], float))
-    ring = (away.min(axis=1) <= float(rings["height"]) / 2) & (
-        abs(phi) <= float(rings["half_angle"])
-    )
-    return ring, np.hypot(away, (distance * phi)[:, None]).argmin(axis=0)
 
 
 def tool_surface(tool: Shape) -> tuple[np.ndarray, np.ndarray]:

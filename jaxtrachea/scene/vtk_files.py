@@ -1,0 +1,89 @@
+"""A simulation for ParaView: a surface in VTK's XML format for each row, and their times.
+
+Format: VTK file formats, https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html.
+"""
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from jaxtrachea.files.atomic import write_text
+from jaxtrachea.scene.recording import Recording
+
+#: VTK's name of a dtype, and the dtype that is written.
+_KINDS = {"f": ("Float32", "<f4"), "i": ("Int32", "<i4"), "u": ("UInt8", "u1")}
+
+
+def write_vtk(folder: Path, recording: Recording) -> None:
+    """Write `simulation.pvd`, and below `vtk/` a wall, a tool and a contact point for each row.
+
+    Lengths are in mm, times in s, or numbers of rows where the path has no time. A row without a
+    solution has its tool alone. The wall has `displacement` (mm) and `ring` (1 on a ring), the
+    contact point `force` (N), `s` (mm) and `phi` (rad).
+
+    Args:
+        folder: that exists.
+        recording: see there.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    (folder / "vtk").mkdir()
+    sets = []
+
+    def add(row: int, part: int, name: str, text: str) -> None:
+        path = f"vtk/{name}_{row + 1:04d}.vtp"
+        write_text(folder / path, text)
+        time = f"{recording.times[row]:.9g}"
+        sets.append(f'<DataSet timestep="{time}" part="{part}" name="{name}" file="{path}"/>')
+
+    for row in range(len(recording.times)):
+        if (wall := recording.walls[row]) is not None:
+            point = {"displacement": wall - recording.rest, "ring": recording.ring.astype(np.uint8)}
+            add(row, 0, "wall", _surface(wall, recording.faces, point))
+        if recording.tool is not None:
+            corners, faces = recording.tool
+            placed = corners @ recording.rotation[row].T + recording.translation[row]
+            add(row, 1, "tool", _surface(placed, faces, {}))
+        if wall is not None:
+            at = {name: v[row : row + 1] for name, v in recording.at_contact.items()}
+            add(row, 2, "contact", _surface(recording.contact(row)[None], None, at))
+    body = "\n".join(sets)
+    write_text(
+        folder / "simulation.pvd", _file("Collection", f"<Collection>\n{body}\n</Collection>")
+    )
+
+
+def _surface(points, faces, at_points: Mapping[str, np.ndarray]) -> str:
+    """A file of triangles, or of single points, with values at the points."""
+    cells, size = ("Verts", 1) if faces is None else ("Polys", 3)
+    corners = np.arange(len(points)) if faces is None else np.asarray(faces)
+    count = corners.size // size
+    ends = size * np.arange(1, count + 1)
+    values = "".join(_array(name, v) for name, v in at_points.items())
+    parts = [
+        f"<PointData>{values}</PointData>",
+        f"<Points>{_array('points', points)}</Points>",
+        f"<{cells}>{_array('connectivity', corners.ravel())}{_array('offsets', ends)}</{cells}>",
+    ]
+    counts = f'NumberOfPoints="{len(points)}" NumberOf{cells}="{count}"'
+    return _file("PolyData", f"<PolyData><Piece {counts}>{''.join(parts)}</Piece></PolyData>")
+
+
+def _array(name: str, values) -> str:
+    """Values in base64 behind their number of bytes."""
+    values = np.asarray(values)
+    kind, dtype = _KINDS[values.dtype.kind]
+    data = values.astype(dtype).tobytes()
+    text = base64.b64encode(np.uint64(len(data)).astype("<u8").tobytes() + data).decode()
+    components = values.shape[1] if values.ndim == 2 else 1
+    head = f'type="{kind}" Name={quoteattr(name)} NumberOfComponents="{components}"'
+    return f'<DataArray {head} format="binary">{text}</DataArray>'
+
+
+def _file(kind: str, body: str) -> str:
+    head = f'type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64"'
+    return f'<?xml version="1.0"?>\n<VTKFile {head}>\n{body}\n</VTKFile>\n'
