@@ -124,6 +124,7 @@ WITHIN = {
         {"labels", "population", "repeats", "relaxation_curves"},
         {"analysis", "comparison"},
         {"design", "influence", "posterior"},
+        {"posterior_file"},
         {"analyses"},
     ],
     "inference/design": [{"press", "candidates"}, {"situation"}, {"choice"}, {"identifiability"}],

@@ -23,6 +23,7 @@ from jaxtrachea.inference.analyses.posterior import POSTERIOR, posterior_table
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.estimate import lane_of
 from jaxtrachea.inference.posterior import Posterior, log_density, posterior
+from jaxtrachea.inference.posterior_file import write_posterior
 from jaxtrachea.inference.posterior_start import around_the_fit, mode
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
@@ -245,6 +246,29 @@ def test_poor_chains_are_said_beside_the_estimates():
     assert not poor(AnalysisResults(drawn.result, ((POSTERIOR, made(1.0, 900.0, 0)),)))
 
 
+def test_arviz_and_xarray_read_the_draws(tmp_path):
+    """Every draw in its unit, by chain, draw and specimen; units and divergences with them."""
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
+    drawn = made(1.0, 900.0, 3)
+    theta = np.random.default_rng(1).normal(size=drawn.theta.shape)
+    drawn = dataclasses.replace(drawn, theta=theta)
+    write_posterior(drawn, tmp_path / "posterior.nc")
+    given = {"engine": "h5netcdf", "group": "posterior"}
+    with xarray.open_dataset(tmp_path / "posterior.nc", **given) as read:
+        assert dict(read.sizes) == {"chain": 2, "draw": 100, "specimen": 1}
+        assert read.specimen.values.tolist() == ["T t"]
+        for i, (p, _, _) in enumerate(drawn.result.study.unknowns[0]):
+            found = read[p.name].transpose("specimen", "chain", "draw")
+            expected = [[[p.from_scaled(v) for v in row] for row in theta[0, ..., i]]]
+            np.testing.assert_allclose(found.values, expected, rtol=1e-12)
+            assert found.attrs["units"] == p.unit
+    given["group"] = "sample_stats"
+    with xarray.open_dataset(tmp_path / "posterior.nc", **given) as read:
+        assert read.diverging.dtype == bool
+        assert int(read.diverging.sum()) == 3
+
+
 @pytest.mark.slow
 def test_well_conditioned_lanes_are_those_of_quadrature(blackjax):
     """Conditions 5 to 14, bounds and numbers of draws as users have them; 200 asked, more drawn."""
@@ -277,4 +301,5 @@ def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys, blackj
         low = file["posterior/lower"][0, 0]
     with Path("out/parameters.csv").open(newline="") as stream:
         assert float(next(csv.DictReader(stream))["posterior_low95"]) == low
+    assert Path("out/posterior.nc").is_file()
     assert "4 chains of 100 draws" in Path("out/report.md").read_text()

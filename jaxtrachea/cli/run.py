@@ -102,8 +102,10 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
 
 
 def write_tables(folder: Path, findings) -> None:
-    """The CSV files of the analyses."""
+    """The CSV files of the analyses, and what else they write."""
     for analysis, found in findings.found:
+        for name, write_file in analysis.files.items():
+            write_file(found, folder / name)
         for name, rows in analysis.tables(found).items():
             rows.write_csv(folder / name)
 

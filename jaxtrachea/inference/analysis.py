@@ -7,6 +7,7 @@ users give it: a key in `config.UncertaintySection`, an option in `cli.main`.
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from jaxtrachea._arguments import check_word
@@ -122,6 +123,7 @@ class Analysis:
         warning: paragraphs below the table of estimates.
         sentences: sentences on the terminal, below its table.
         figures: what draws each picture, by name of the file.
+        files: what writes each further file, by its name, for (found, path).
         unreliable: whether it came out so that the command ends with exit code 1.
     """
 
@@ -146,6 +148,7 @@ class Analysis:
     warning: Callable[[Any], list[str]] = lambda found: []
     sentences: Callable[[Any], Iterable[str]] = lambda found: ()
     figures: Callable[[Any], Mapping[str, Callable[[], Any]]] = lambda found: {}
+    files: Mapping[str, Callable[[Any, Path], None]] = dataclasses.field(default_factory=dict)
     unreliable: Callable[[Any], bool] = lambda found: False
 
     def __post_init__(self):

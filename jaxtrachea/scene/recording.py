@@ -63,8 +63,8 @@ def recording_of(stored: StoredSimulation) -> Recording:
     if rest is None or series.vertices is None:
         raise NoSurface("has no surface", cure="simulate with surface = true in [output]")
     moved = np.asarray(series.vertices, float)
-    solved = np.isfinite(moved).all(axis=(1, 2))
-    if not solved.any():
+    solved = [bool(np.isfinite(v).all()) for v in moved]
+    if not any(solved):
         raise NoSurface("has no solved row", cure="see the status of its rows")
     rows, time = len(moved), series.time
     turn = np.asarray(rest["phi"] - np.asarray(series.phi)[:, None] + np.pi) % (2 * np.pi) - np.pi
@@ -76,7 +76,7 @@ def recording_of(stored: StoredSimulation) -> Recording:
         rest=np.asarray(rest["vertices"], float),
         faces=np.asarray(rest["faces"]),
         ring=rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)[0],
-        walls=[v if ok else None for v, ok in zip(moved, solved.tolist(), strict=True)],
+        walls=[v if ok else None for v, ok in zip(moved, solved, strict=True)],
         nearest=np.nan_to_num(away, nan=np.inf).argmin(axis=1),
         at_contact={n: np.asarray(getattr(series, n), float) for n in ("force", "s", "phi")},
         tool=None if stored.tool is None else tool_triangles(stored.tool),

@@ -7,6 +7,7 @@ from jaxtrachea.files.table import Column, Table, ends
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import lane_label, unknown_rows
 from jaxtrachea.inference.posterior import MissingSampler, Posterior, posterior, sampler
+from jaxtrachea.inference.posterior_file import write_posterior
 from jaxtrachea.inference.rows import and_more
 
 #: Lanes that are named; of more, the number.
@@ -91,7 +92,7 @@ def _section(posterior: Posterior) -> list[str]:
         f"{chains} chains of {draws} draws (NUTS{more}), priors uniform in scaled coordinates "
         "between the bounds. Good: R-hat up to 1.01, 400 effective draws, nothing divergent. Of "
         "poor chains (R-hat above 1.05, less than 100 effective draws, or more than 2 % divergent) "
-        "no interval is given. All draws: `results.h5` (docs/read_a_fit.md).",
+        "no interval is given. All draws: `posterior.nc` (docs/read_a_fit.md).",
         *(distrust(posterior) or ["All chains are good."]),
     ]
 
@@ -125,5 +126,6 @@ POSTERIOR = Analysis(
     table=posterior_table,
     section=_section,
     warning=distrust,
+    files={"posterior.nc": write_posterior},
     unreliable=_poor,
 )
