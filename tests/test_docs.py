@@ -108,7 +108,10 @@ def python_blocks():
 def test_each_page_is_listed_once_and_says_who_needs_it():
     listed = re.findall(r"\]\(docs/(\w+)\.md\)", (ROOT / "README.md").read_text().split("\n## ")[2])
     assert listed[: len(PATH)] == PATH
-    assert sorted(listed) == sorted(page.stem for page in DOCS.glob("*.md"))
+    pages = {page.stem for page in DOCS.glob("*.md")} - {"index"}  # of the site; here the README
+    assert sorted(listed) == sorted(pages)
+    site = re.findall(r'= "(\w+)\.md"', (ROOT / "zensical.toml").read_text())
+    assert sorted(site) == sorted(pages | {"index"})
     pages = (DOCS / "evidence.md").read_text().partition("## The pages")[2]
     listed = re.findall(r"\]\(evidence/(\w+)\.md\)", pages)
     assert sorted(listed) == sorted(page.stem for page in (DOCS / "evidence").glob("*.md"))
