@@ -13,9 +13,14 @@ import pytest
 from admitted import FULL
 
 from jaxtrachea.mechanics.friction import Coulomb
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.mechanics.press_contacts import press_contacts
+from jaxtrachea.mechanics.press_in_time import press_in_time
 from jaxtrachea.mechanics.skeleton import skeleton_response
+from jaxtrachea.relaxation.filter import Relaxation
+from jaxtrachea.relaxation.steps import Branches
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.simulation import simulate
@@ -155,3 +160,39 @@ def test_a_status_with_a_solution_says_so():
     """As its message does; no contact is a solution, too."""
     for status in PressStatus:
         assert status.solved == (status.message.startswith("solved") or status == 1), status
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_wall_beyond_the_axis_is_told(dtype):
+    """The wall moves by what the tool presses beyond first touch: TOO_DEEP past the radius, solved.
+
+    Along the normal, by a vector, along a path, at two places, in time. Another row is not touched,
+    nor is a pull that finds no contact.
+    """
+    material = Material(EI_L=1.862, EI_C=13.07, EA_L=3.9, k_M=0.1, k_t=0.4, k_1=0.3, k_3=0.02)
+    g, material = jax.tree.map(lambda v: jnp.asarray(v, dtype), (table_1(), material))
+    onset = dtype(1.5)
+    depth = np.array([1.0, 0.999 * 11.3 + 1.5, 1.001 * 11.3 + 1.5, 100.0, -30.0], dtype)
+    told = [PressStatus.NO_CONTACT, OK, *[PressStatus.TOO_DEEP] * 2, PressStatus.NO_CONTACT]
+    vector = depth[:, None] * np.array([0, -1, 0], dtype)
+    relaxes = Relaxation(Branches(*np.array([[0.5], [1.0]], dtype)))
+    motion = Motion(dtype(60), depth, onset=onset, time=np.arange(5, dtype=dtype))
+
+    @jax.jit
+    def all_of_them(D, v):
+        one = press(g, material, dtype(60), D, onset=onset)
+        oblique = press_oblique(g, material, dtype(60), dtype(0), v, onset=onset)
+        path = press_path(g, material, dtype(60), dtype(0), v, Coulomb(dtype(0.5)), onset=onset)
+        pair = jnp.stack([D, jnp.full_like(D, 2)], axis=1)
+        two = press_contacts(
+            g, material, np.array([20, 120], dtype), pair, onset=jnp.stack([onset, onset])
+        )
+        timed = press_in_time(g, material, motion, relaxes, Options(relaxation="uniform"))
+        found = one.status, oblique.status, path.press.status, two.status[:, 0], timed.status
+        return found, two.status[:, 1], one.force
+
+    found, other, force = all_of_them(depth, vector)
+    for status in found:
+        np.testing.assert_array_equal(status, told)
+    np.testing.assert_array_equal(other, [OK] * 5)
+    assert np.isfinite(force).all()

@@ -24,6 +24,7 @@ from jaxtrachea.mechanics.validation import (
     Validated,
     check_place,
     float_type,
+    mark_deep,
     mask,
     status_of,
     validate,
@@ -149,7 +150,7 @@ def press_oblique(
         onset: inward displacement at first touch, mm; 0 if None.
 
     Returns:
-        The `ObliquePress`; NaN as for `press`.
+        The `ObliquePress`; NaN, and TOO_DEEP, as for `press`.
 
     Raises:
         ValueError: a missing value of the material, an argument that is no number, or an array of
@@ -172,7 +173,8 @@ def _press_oblique(
 ) -> ObliquePress:
     """`press_oblique`, of arguments that are checked."""
     place = place_at(geometry, material, s_c, phi_c, options, onset=onset)
-    return press_at(place, displacement, options.press)
+    press = press_at(place, displacement, options.press)
+    return press._replace(status=_mark_deep(place, displacement, press.status, geometry))
 
 
 def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
@@ -275,7 +277,9 @@ def _press_path(
     D, C, friction, refused = _rubbed(place, displacement, friction, options)
     height = jnp.where(place.onset >= 0, place.onset, 0)
     slid = _friction.slide_path(D, C, place.law, friction, height=height)
-    return _path_of(place, slid, refused)
+    path = _path_of(place, slid, refused)
+    status = _mark_deep(place, displacement, path.press.status, geometry)
+    return path._replace(press=path.press._replace(status=status))
 
 
 def slide_at(
@@ -313,6 +317,13 @@ def _path_of(place: Place, slid: Slide, refused) -> ObliquePath:
     press = assemble(unit, product(slid.force, frame), product(slid.depth, frame), status)
     sliding = slid.sliding & (refused == PressStatus.OK)
     return ObliquePath(press, product(slid.slip, frame[1:]), slid.dissipated, sliding)
+
+
+def _mark_deep(place: Place, displacement: Float[Array, "*n 3"], status, geometry: Geometry):
+    """As `mark_deep`, of vectors from rest."""
+    touch = jnp.broadcast_to(place.onset * local_frame(place.phi_c)[0], displacement.shape)
+    moved = displacement - touch.astype(displacement.dtype)
+    return mark_deep(status, jnp.sum(moved * moved, axis=-1), geometry.radius**2)
 
 
 def place_at(

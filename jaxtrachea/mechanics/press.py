@@ -17,6 +17,7 @@ from jaxtrachea.mechanics.validation import (
     check_place,
     check_shapes,
     float_type,
+    mark_deep,
     mask,
     status_of,
     validate,
@@ -258,6 +259,8 @@ def press(
 
     Returns:
         The `Press`; rows without a stable solution are NaN with a status, others are untouched.
+        Rows where the wall moves further than the tube's radius are TOO_DEEP: solved, but beyond
+        what ring and ligament are linear for (15 % at a quarter of it, docs/validity.md).
         A contact off the tube (OFF_TUBE), a negative stiffness (BAD_MATERIAL) and one or a place
         that is no number (NON_FINITE) are NaN throughout; a stiffness of zero is the limit of a
         small one where that exists.
@@ -306,6 +309,7 @@ def _press(
         return scaled(factor[..., None], jnp.broadcast_to(v, (*displacement.shape, *v.shape)))
 
     load = solved.force if solved.load is None else solved.load
+    status = mark_deep(solved.status, displacement - onset, geometry.radius)
     return Press(
         force=solved.force,
         depth=solved.depth,
@@ -313,5 +317,5 @@ def _press(
         joints=per_ring(load, unit.w),
         reactions=per_ring(solved.force, unit.reaction),
         compliance=unit.w_C,
-        status=status_of(refused, solved.status),
+        status=status_of(refused, status),
     )

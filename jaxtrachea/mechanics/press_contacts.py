@@ -13,7 +13,14 @@ from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.influence import influence, level_influence
 from jaxtrachea.mechanics.levels.options import Options, check_line
 from jaxtrachea.mechanics.press import ligament_beam, local_law, read_values
-from jaxtrachea.mechanics.validation import check_shapes, float_type, mask, status_of, validate
+from jaxtrachea.mechanics.validation import (
+    check_shapes,
+    float_type,
+    mark_deep,
+    mask,
+    status_of,
+    validate,
+)
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
@@ -154,6 +161,8 @@ def _press_contacts(
     force, depth, status = (
         v.reshape(displacement.shape) for v in (solved.force, solved.depth, solved.status)
     )
+    moved = displacement - jnp.broadcast_to(onset, displacement.shape).astype(displacement.dtype)
+    status = mark_deep(status, moved, geometry.radius)
     unit, force, depth = mask(refused, unit, force, depth)
     return Contacts(
         force=force,

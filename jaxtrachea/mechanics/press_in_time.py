@@ -19,6 +19,7 @@ from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.mechanics.validation import (
     check_place,
     float_type,
+    mark_deep,
     mask,
     status_of,
     validate,
@@ -127,6 +128,7 @@ def _press_in_time(
         apart = relaxation.skeleton is not None
         way = way_of(solved.load, unit.w_C, law) if apart else moved
         solved, status = softened(solved, status, softening, way)
+    status = mark_deep(status, displacement - onset, geometry.radius)
     unit, solved = mask(refused, unit, solved)
     load = solved.load
 

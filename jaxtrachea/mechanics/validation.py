@@ -188,6 +188,21 @@ def mask(refused: Int[Array, ""], *arrays: Any) -> Any:
     return hidden[0] if len(hidden) == 1 else hidden
 
 
+def mark_deep(
+    status: Int[Array, "*n"], moved: Float[Array, "*n"], radius: Float[Array, ""]
+) -> Int[Array, "*n"]:
+    """TOO_DEEP in the place of OK where the wall has moved further than the tube's radius.
+
+    Args:
+        status: a `PressStatus` each.
+        moved: motion of the wall at the contact, mm.
+        radius: of the tube, mm.
+    """
+    far = jnp.abs(moved) > jnp.asarray(radius, moved.dtype)
+    deep = (status == PressStatus.OK) & far
+    return jnp.where(deep, PressStatus.TOO_DEEP, status).astype(jnp.int8)
+
+
 def status_of(
     refused: Int[Array, ""], status: Int[Array, "*n"], own: Int[Array, ""] | None = None
 ) -> Int[Array, "*n"]:
