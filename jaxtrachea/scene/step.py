@@ -37,7 +37,7 @@ from jaxtrachea.scene.stage import Poses, Scene, check_kind, check_material, tou
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.
-STATE_VERSION = 2
+STATE_VERSION = 3
 
 
 class Origin(NamedTuple):

@@ -1,4 +1,4 @@
-"""A tool from a surface file: one convex body, its corners the vertices of the shape."""
+"""A tool from a surface file: convex bodies, their corners the vertices of its parts."""
 
 from pathlib import Path
 
@@ -6,21 +6,27 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.contact import shapes
-from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.cleaning import Surface, labels
+from jaxtrachea.trachea.mesh import MeshError, unique_rows, volume
 from jaxtrachea.trachea.objects import combined
 from jaxtrachea.trachea.surface_file import parts_of
 from jaxtrachea.units import UnitError, unit_factor
 
 #: Share of its size that a surface may lie inside of its convex hull.
 HOLLOW = 0.01
-#: Corners of a tool at most: the cost of a contact grows with them.
+#: Share of the size of an object within which corners are one.
+WELDED = 1e-7
+#: Corners of a convex part at most: the cost of a contact grows with them.
 MAX_CORNERS = 256
 #: Share of its size that corners may be left out by, at most.
 COARSEST = 0.01
 
 
 def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Shape, str]:
-    """A convex tool about the origin of its file, and a note on its size.
+    """A tool about the origin of its file, one convex body or several, and a note on its size.
+
+    Several bodies are the objects of the file, and what of one hangs together by its corners; they
+    may touch each other or overlap.
 
     Args:
         path: STL, OBJ, PLY, GLB and what else trimesh reads.
@@ -28,31 +34,98 @@ def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Sha
         rounding: mm, on top of the surface on every side.
 
     Raises:
-        MeshError: no surface, not convex, or with more corners than a tool may have and none that
-            can be left out.
+        MeshError: no surface, a body that is not convex or inside out, more bodies than a tool may
+            have, or one with more corners than it may have and none that can be left out.
     """
     try:
         scale = unit_factor(unit or "mm", "length")
     except UnitError as error:
         raise MeshError(str(error), key="unit") from None
-    surface = combined(list(parts_of(path).values()))
-    corners = surface.vertices[surface.faces] * float(scale)
-    points = np.unique(corners.reshape(-1, 3), axis=0)
-    size = float(np.ptp(points, axis=0).max())
-    # Two bodies apart have their corners on the hull, but not the middle of their inner faces.
-    inside = np.concatenate([points, corners.mean(axis=1)])
-    hollow = max(-float(_outside(inside, _planes(points)).min()), 0.0)
-    if hollow > HOLLOW * size:
-        raise MeshError(
-            f"it is not convex: its surface lies {hollow:.3g} mm and more inside of its hull",
-            cure="cut it into convex parts, and take the one that touches the trachea",
-        )
-    kept, left_out = _corners(points, size)
-    sizes = " x ".join(f"{v:.3g}" for v in np.ptp(points, axis=0))
-    note = f"tool: {sizes} mm, {len(kept)} corners"
+    objects = parts_of(path)
+    objects = {n: Surface(part.vertices * float(scale), part.faces) for n, part in objects.items()}
+    whole = combined(list(objects.values()))
+    size, hollow = float(np.ptp(whole.vertices, axis=0).max()), _hollow(whole)
+    if hollow <= HOLLOW * size:
+        found, names = [whole], ["it"]
+    else:
+        found, names = _bodies(objects)
+        if len(found) == 1:
+            names = ["it"]
+        _check_bodies(found, names)
+    kept, left_out = [], 0.0
+    for body, name in zip(found, names, strict=True):
+        corners, out = _corners(body, name)
+        kept.append(shapes.cloud(corners, rounding, float))
+        left_out = max(left_out, out)
+    sizes = " x ".join(f"{v:.3g}" for v in np.ptp(_points(whole), axis=0))
+    of = f" {len(kept)} convex parts," if len(kept) > 1 else ""
+    count = sum(part.vertices.shape[1] for part in kept)
+    note = f"tool: {sizes} mm,{of} {count} corners"
     if left_out > 0:
         note += f"; those left out stand out of it by up to {left_out:.2g} mm"
-    return shapes.cloud(kept, rounding, float), note
+    return kept[0] if len(kept) == 1 else shapes.compound(kept), note
+
+
+def _bodies(objects: dict[str, Surface]) -> tuple[list[Surface], list[str]]:
+    """What hangs together by its corners, object by object, and a name for each."""
+    found, names = [], []
+    for name, (vertices, faces) in objects.items():
+        grid = np.round(
+            (vertices - vertices.min(axis=0)) / (WELDED * np.ptp(vertices, axis=0).max())
+        )
+        first, same = unique_rows(grid)
+        faces = same[faces]
+        piece = labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(first))[faces[:, 0]]
+        pieces = np.unique(piece)
+        for i, label in enumerate(pieces):
+            used, own = np.unique(faces[piece == label], return_inverse=True)
+            found.append(Surface(vertices[first][used], own.reshape(-1, 3)))
+            names.append(name if len(pieces) == 1 else f"{name}, body {i}")
+    return found, names
+
+
+def _check_bodies(found: list[Surface], names: list[str]) -> None:
+    """Refuse bodies that are no convex parts of a tool.
+
+    Raises:
+        MeshError: too many, one that is not convex, or one inside out beside others that are not.
+    """
+    if len(found) > shapes.MAX_PARTS:
+        raise MeshError(
+            f"it has {len(found)} bodies; expected at most {shapes.MAX_PARTS} convex parts",
+            cure="leave out those that do not touch the trachea, or join them in fewer",
+        )
+    outward = [volume(*body) > 0 for body in found]
+    for body, name, right in zip(found, names, outward, strict=True):
+        hollow = _hollow(body)
+        if hollow > HOLLOW * float(np.ptp(body.vertices, axis=0).max()):
+            raise MeshError(
+                f"{name} is not convex: its surface lies {hollow:.3g} mm and more inside of its "
+                "hull",
+                cure="cut it into convex parts, each a body by itself or an object of the file "
+                "(the Python packages coacd and vhacdx do, trimesh's convex_decomposition by the "
+                "latter)",
+            )
+        if not right and any(outward):
+            raise MeshError(
+                f"{name} is inside out, other bodies are not: its triangles face inwards",
+                cure="turn them, or remove it if it is the hole of another",
+            )
+
+
+def _points(body: Surface) -> Float[np.ndarray, "n 3"]:
+    """Different corners of the triangles."""
+    return np.unique(body.vertices[body.faces].reshape(-1, 3), axis=0)
+
+
+def _hollow(body: Surface) -> float:
+    """How far the surface lies inside of its hull, mm: at its corners or amid its triangles.
+
+    Two bodies apart have their corners on the hull, but not the middle of their inner faces.
+    """
+    corners, points = body.vertices[body.faces], _points(body)
+    inside = np.concatenate([points, corners.mean(axis=1)])
+    return max(-float(_outside(inside, _planes(points)).min()), 0.0)
 
 
 def _planes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "faces 4"]:
@@ -79,16 +152,17 @@ def _outside(points: Float[np.ndarray, "n 3"], planes: Float[np.ndarray, "f 4"])
     ])  # fmt: skip
 
 
-def _corners(points: Float[np.ndarray, "n 3"], size: float) -> tuple[np.ndarray, float]:
-    """Corners of the hull, as many as a tool may have, and how far the others stand out, mm."""
+def _corners(body: Surface, name: str) -> tuple[np.ndarray, float]:
+    """Corners of the hull, as many as a part may have, and how far the others stand out, mm."""
+    points = _points(body)
     kept = np.asarray(shapes.hull(points, dtype=float).vertices).T
     if len(kept) <= MAX_CORNERS:
         return kept, 0.0
     few = _foremost(kept, MAX_CORNERS)
     left_out = max(float(_outside(kept, _planes(few)).max()), 0.0)
-    if left_out > COARSEST * size:
+    if left_out > COARSEST * float(np.ptp(points, axis=0).max()):
         raise MeshError(
-            f"it has {len(kept)} corners; of {MAX_CORNERS} some stand out by {left_out:.2g} mm",
+            f"{name} has {len(kept)} corners; of {MAX_CORNERS} some stand out by {left_out:.2g} mm",
             cure="simplify the surface, or replace round edges by rounding = '1 mm'",
         )
     return few, left_out
