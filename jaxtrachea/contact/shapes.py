@@ -263,7 +263,8 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
         The parts, stacked: vertices (parts, 3, n), radius (parts,), weights (parts, n) or None.
 
     Raises:
-        ValueError: no part, or more than there may be; poses that are not one a shape, or none.
+        ValueError: no part, or more than there may be; another dtype; poses that are not one a
+            shape, or no rotations.
     """
     poses = [None] * len(shapes) if poses is None else poses
     if len(poses) != len(shapes):
@@ -275,6 +276,12 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
         found += [part if pose is None else _moved(part, pose) for part in parts_of(shape)]
     if not 1 <= len(found) <= MAX_PARTS:
         raise ValueError(f"shapes: expected 1 to {MAX_PARTS} convex parts, found {len(found)}")
+    dtype = found[0].vertices.dtype
+    for i, part in enumerate(found):
+        if part.vertices.dtype != dtype:
+            raise ValueError(
+                f"shapes: part {i} is {part.vertices.dtype}; expected {dtype}, as the first"
+            )
     most = max(part.vertices.shape[1] for part in found)
     if any(part.vertices.shape[1] < most or part.weights is not None for part in found):
         found = [padded(part, most) for part in found]

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxtrachea.contact import shapes
 from jaxtrachea.trachea.cleaning import Surface, labels
-from jaxtrachea.trachea.mesh import MeshError, unique_rows, volume
+from jaxtrachea.trachea.mesh import MeshError, edge_counts, unique_rows, volume
 from jaxtrachea.trachea.objects import combined
 from jaxtrachea.trachea.surface_file import parts_of
 from jaxtrachea.units import UnitError, unit_factor
@@ -16,6 +16,8 @@ from jaxtrachea.units import UnitError, unit_factor
 HOLLOW = 0.01
 #: Share of the size of an object within which corners are one.
 WELDED = 1e-7
+#: Share of its hull that a closed body may leave empty.
+EMPTY = 0.1
 #: Corners of a convex part at most: the cost of a contact grows with them.
 MAX_CORNERS = 256
 #: Share of its size that corners may be left out by, at most.
@@ -41,19 +43,25 @@ def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Sha
         scale = unit_factor(unit or "mm", "length")
     except UnitError as error:
         raise MeshError(str(error), key="unit") from None
-    objects = parts_of(path)
-    objects = {n: Surface(part.vertices * float(scale), part.faces) for n, part in objects.items()}
-    whole = combined(list(objects.values()))
-    size, hollow = float(np.ptp(whole.vertices, axis=0).max()), _hollow(whole)
-    if hollow <= HOLLOW * size:
-        found, names = [whole], ["it"]
-    else:
-        found, names = _bodies(objects)
-        if len(found) == 1:
-            names = ["it"]
-        _check_bodies(found, names)
+    objects = {
+        name: _welded(Surface(part.vertices * float(scale), part.faces))
+        for name, part in parts_of(path).items()
+    }
+    whole = _welded(combined(list(objects.values())))
+    pieces = _pieces(whole)
+    if len(pieces) == 1 or not all(map(_closed, pieces)):
+        pieces = [whole] if _unlike_hull(whole) is None else []
+    found = {"it": whole}
+    if len(pieces) != 1:
+        found = {
+            name if len(pieces) == 1 else f"{name}, body {i}": body
+            for name, part in objects.items()
+            for pieces in [_pieces(part)]
+            for i, body in enumerate(pieces)
+        }
+        _check_bodies(found if len(found) > 1 else {"it": whole})
     kept, left_out = [], 0.0
-    for body, name in zip(found, names, strict=True):
+    for name, body in found.items():
         corners, out = _corners(body, name)
         kept.append(shapes.cloud(corners, rounding, float))
         left_out = max(left_out, out)
@@ -66,25 +74,33 @@ def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Sha
     return kept[0] if len(kept) == 1 else shapes.compound(kept), note
 
 
-def _bodies(objects: dict[str, Surface]) -> tuple[list[Surface], list[str]]:
-    """What hangs together by its corners, object by object, and a name for each."""
-    found, names = [], []
-    for name, (vertices, faces) in objects.items():
-        grid = np.round(
-            (vertices - vertices.min(axis=0)) / (WELDED * np.ptp(vertices, axis=0).max())
-        )
-        first, same = unique_rows(grid)
-        faces = same[faces]
-        piece = labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(first))[faces[:, 0]]
-        pieces = np.unique(piece)
-        for i, label in enumerate(pieces):
-            used, own = np.unique(faces[piece == label], return_inverse=True)
-            found.append(Surface(vertices[first][used], own.reshape(-1, 3)))
-            names.append(name if len(pieces) == 1 else f"{name}, body {i}")
-    return found, names
+def _welded(surface: Surface) -> Surface:
+    """Corners at one place are one vertex; collapsed triangles are left out."""
+    vertices, size = surface.vertices, float(np.ptp(surface.vertices, axis=0).max())
+    first, same = unique_rows(np.round((vertices - vertices.min(axis=0)) / (WELDED * size or 1)))
+    faces = same[surface.faces]
+    return Surface(vertices[first], faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
 
 
-def _check_bodies(found: list[Surface], names: list[str]) -> None:
+def _pieces(surface: Surface) -> list[Surface]:
+    """What hangs together by its corners."""
+    vertices, faces = surface
+    piece = labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(vertices))[faces[:, 0]]
+    found = []
+    for label in np.unique(piece):
+        used, own = np.unique(faces[piece == label], return_inverse=True)
+        found.append(Surface(vertices[used], own.reshape(-1, 3)))
+    return found
+
+
+def _closed(body: Surface) -> bool:
+    """Whether a volume is known: two triangles at every edge, in opposite directions."""
+    directed = body.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    once = len(unique_rows(directed)[0]) == len(directed)
+    return once and bool((edge_counts(body.faces)[1] == 2).all())
+
+
+def _check_bodies(found: dict[str, Surface]) -> None:
     """Refuse bodies that are no convex parts of a tool.
 
     Raises:
@@ -95,22 +111,34 @@ def _check_bodies(found: list[Surface], names: list[str]) -> None:
             f"it has {len(found)} bodies; expected at most {shapes.MAX_PARTS} convex parts",
             cure="leave out those that do not touch the trachea, or join them in fewer",
         )
-    outward = [volume(*body) > 0 for body in found]
-    for body, name, right in zip(found, names, outward, strict=True):
-        hollow = _hollow(body)
-        if hollow > HOLLOW * float(np.ptp(body.vertices, axis=0).max()):
+    outward = {name: volume(*body) > 0 for name, body in found.items()}
+    for name, body in found.items():
+        if how := _unlike_hull(body):
             raise MeshError(
-                f"{name} is not convex: its surface lies {hollow:.3g} mm and more inside of its "
-                "hull",
+                f"{name} is not convex: {how}",
                 cure="cut it into convex parts, each a body by itself or an object of the file "
-                "(the Python packages coacd and vhacdx do, trimesh's convex_decomposition by the "
-                "latter)",
+                "(the Python packages coacd and vhacdx do; trimesh's convex_decomposition calls "
+                "the latter)",
             )
-        if not right and any(outward):
+        if not outward[name] and any(outward.values()):
             raise MeshError(
                 f"{name} is inside out, other bodies are not: its triangles face inwards",
                 cure="turn them, or remove it if it is the hole of another",
             )
+
+
+def _unlike_hull(body: Surface) -> str | None:
+    """How a surface differs from its convex hull; None: it is that."""
+    hollow = _hollow(body)
+    if hollow > HOLLOW * float(np.ptp(body.vertices, axis=0).max()):
+        return f"its surface lies {hollow:.3g} mm and more inside of its hull"
+    if not _closed(body):
+        return None
+    # A long thin fork: all of its surface is near its hull.
+    own, hull = abs(volume(*body)), _hull(body.vertices).volume
+    if own < (1 - EMPTY) * hull:
+        return f"its volume is {own:.3g} mm^3, that of its hull {hull:.3g} mm^3"
+    return None
 
 
 def _points(body: Surface) -> Float[np.ndarray, "n 3"]:
@@ -129,7 +157,12 @@ def _hollow(body: Surface) -> float:
 
 
 def _planes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "faces 4"]:
-    """Planes of the convex hull, outward normals first.
+    """Planes of the convex hull, outward normals first."""
+    return _hull(points).equations
+
+
+def _hull(points: Float[np.ndarray, "n 3"]):
+    """The convex hull.
 
     Raises:
         MeshError: flat, or a line.
@@ -137,7 +170,7 @@ def _planes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "faces 4"]:
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        return ConvexHull(points).equations
+        return ConvexHull(points)
     except (QhullError, ValueError):
         raise MeshError(
             "it is flat; expected a body", cure="give it a thickness, or take shape = 'cloud'"
