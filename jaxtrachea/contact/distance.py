@@ -215,7 +215,7 @@ def approach(
 
 def direction_table(a: Shape, settings: Settings = STANDARD) -> Float[Array, " directions"]:
     """Support of A about its centre over the coarse directions, mm; the same for every pose."""
-    centre = mean(a.vertices, a.weights)
+    centre = mean(a.vertices, a.counts)
     return sharp_table(a.vertices - centre[:, None], settings.directions)
 
 
@@ -229,7 +229,7 @@ class _Scaled(eqx.Module):
 
 def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled:
     """Lengths over the size, about A's centre: translations cancel before they are rounded."""
-    centre = jax.lax.stop_gradient(mean(a.vertices, a.weights))
+    centre = jax.lax.stop_gradient(mean(a.vertices, a.counts))
     turned = rotate(pose.rotation, b.vertices)
     v_a = a.vertices - centre[:, None]
     v_b = turned + (pose.translation - centre)[:, None]
@@ -237,9 +237,9 @@ def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled
     others = jnp.maximum(jnp.abs(pose.translation), jnp.abs(centre))
     v_a = _without_rounding(v_a, largest(largest(jnp.abs(a.vertices))))
     v_b = _without_rounding(v_b, largest(jnp.maximum(largest(jnp.abs(turned)), others)))
-    size = jax.lax.stop_gradient(_size(v_a, v_b, b.weights, a.radius + b.radius))
+    size = jax.lax.stop_gradient(_size(v_a, v_b, b.counts, a.radius + b.radius))
     sharpness = jnp.asarray(settings.sharpness, size.dtype) if beta is None else beta * size
-    pair = Pair(v_a / size, v_b / size, sharpness, a.weights, b.weights)
+    pair = Pair(v_a / size, v_b / size, sharpness, a.counts, b.counts)
     return _Scaled(pair, centre, size)
 
 

@@ -306,7 +306,7 @@ def gap_bounds(
     moved = dataclasses.replace(tool, vertices=transform(pose, tool.vertices))
 
     def bound(patch, centre):
-        z = middle(moved.vertices, moved.weights) - centre
+        z = middle(moved.vertices, moved.counts) - centre
         for _ in range(NEARING):  # Frank-Wolfe on the difference of the cores, exact steps
             # Of vertices equally far (flat faces), a fixed one: roundings would choose others.
             ahead = z + LEAD * largest(jnp.abs(z)) * jnp.asarray(PREFERRED, z.dtype)
@@ -332,7 +332,7 @@ def _furthest(vertices, direction):
 def _rows_at(shapes: Shape, chosen) -> Shape:
     """Some of the shapes. By rows: XLA runs a program of arrays of at most 512 bytes in order."""
     rows = [shapes.vertices[:, i][chosen] for i in range(3)]
-    counts = None if shapes.weights is None else shapes.weights[chosen]
+    counts = None if shapes.counts is None else shapes.counts[chosen]
     return Shape(jnp.stack(rows, axis=1), shapes.radius[chosen], counts)
 
 
@@ -353,12 +353,13 @@ def _size(tool: Shape, patches: Patches):
 
     def reach(shape):
         # Axis by axis: sums of fewer entries, which may be in one kernel.
-        x, y, z = ((row - middle(row, shape.weights)) ** 2 for row in shape.vertices)
+        x, y, z = ((row - middle(row, shape.counts)) ** 2 for row in shape.vertices)
         return jnp.sqrt(largest(x + y + z)) + shape.radius
 
     def middle(row, counts):
         if counts is not None:
-            return total(row * counts) / total(counts)
+            own = (counts > 0).astype(row.dtype)
+            return total(row * own) / total(own)
         return total(row) / row.shape[0]
 
     patch = jnp.max(jax.vmap(reach)(shapes))

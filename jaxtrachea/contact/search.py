@@ -120,7 +120,7 @@ class Pair(NamedTuple):
     """Vertices of both shapes in one frame, and the sharpness; all dimensionless.
 
     Radii are constants on the sphere of directions and take no part in the search. How often each
-    vertex counts: see `Shape.weights`.
+    vertex counts: see `Shape.counts`.
     """
 
     a: Float[Array, "3 n"]

@@ -53,13 +53,13 @@ class Shape(eqx.Module):
     Attributes:
         vertices: mm, one row per coordinate; shape (3, n).
         radius: of the ball, mm, not negative.
-        weights: how often each vertex counts in the smoothed sum, shape (n,): 0 for one that
-            repeats another to fill up (`padded`), else 1; None: 1 for all.
+        counts: whether each vertex counts in the smoothed sum, shape (n,): 0 for one that repeats
+            another to fill up (`padded`), positive for the others; None: all do.
     """
 
     vertices: Float[Array, "*lanes 3 n"]
     radius: Float[Array, "*lanes"]
-    weights: Float[Array, "*lanes n"] | None = None
+    counts: Float[Array, "*lanes n"] | None = None
 
 
 class Support(eqx.Module):
@@ -85,7 +85,7 @@ def support(shape: Shape, direction: Float[Array, "3"], beta: Float[Array, ""]) 
         beta: sharpness, 1/mm, positive. The bias is at most log(n) / beta.
     """
     along = heights(shape.vertices, direction)
-    value, weights = log_mean(along, beta, shape.weights)
+    value, weights = log_mean(along, beta, shape.counts)
     core = total(shape.vertices * weights[None])
     beyond = value - total(weights * along) + shape.radius
     return Support(value + shape.radius, core + beyond * direction, core)
@@ -102,12 +102,12 @@ def log_mean(
     beta: Float[Array, ""],
     counts: Float[Array, " n"] | None = None,
 ):
-    """(1/beta) log sum counts exp(beta x) and the softmax weights, without overflow."""
+    """(1/beta) log sum exp(beta x) of what counts and the softmax weights, without overflow."""
     if along.shape[0] == 1:  # a ball
         return along[0], jnp.ones_like(along)
     top = jax.lax.stop_gradient(largest(along))
     e = jnp.exp(beta * (along - top))
-    e = e if counts is None else counts * e
+    e = e if counts is None else jnp.where(counts > 0, e, 0)
     whole = total(e)
     return top + jnp.log(whole) / beta, e / whole
 
@@ -115,7 +115,8 @@ def log_mean(
 def mean(vertices: Float[Array, "3 n"], counts: Float[Array, " n"] | None = None):
     """Mean of the vertices that count, mm; shape (3,)."""
     if counts is not None:
-        return total(vertices * counts[None]) / total(counts)
+        own = (counts > 0).astype(vertices.dtype)
+        return total(vertices * own[None]) / total(own)
     return total(vertices) / vertices.shape[1]
 
 
@@ -260,7 +261,7 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
             None: the shapes have that frame.
 
     Returns:
-        The parts, stacked: vertices (parts, 3, n), radius (parts,), weights (parts, n) or None.
+        The parts, stacked: vertices (parts, 3, n), radius (parts,), counts (parts, n) or None.
 
     Raises:
         ValueError: no part, or more than there may be; another dtype; poses that are not one a
@@ -283,7 +284,7 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
                 f"shapes: part {i} is {part.vertices.dtype}; expected {dtype}, as the first"
             )
     most = max(part.vertices.shape[1] for part in found)
-    if any(part.vertices.shape[1] < most or part.weights is not None for part in found):
+    if any(part.vertices.shape[1] < most or part.counts is not None for part in found):
         found = [padded(part, most) for part in found]
     return jax.tree.map(lambda *v: jnp.stack(v), *found)
 
@@ -298,9 +299,9 @@ def parts_of(shape: Shape) -> list[Shape]:
 
 def _unpadded(shape: Shape) -> Shape:
     """Without the vertices that do not count, where that is known."""
-    if shape.weights is None or isinstance(shape.weights, Tracer):
+    if shape.counts is None or isinstance(shape.counts, Tracer):
         return shape
-    return Shape(shape.vertices[:, np.asarray(shape.weights) > 0], shape.radius)
+    return Shape(shape.vertices[:, np.asarray(shape.counts) > 0], shape.radius)
 
 
 def _moved(shape: Shape, pose: Pose) -> Shape:
@@ -323,9 +324,9 @@ def padded(shape: Shape, count: int) -> Shape:
     present = shape.vertices.shape[1]
     if count < present:
         raise ValueError(f"count: expected at least {present} (the vertices), found {count}")
-    own = jnp.ones(present, shape.vertices.dtype) if shape.weights is None else shape.weights
-    weights = jnp.concatenate([own, jnp.zeros(count - present, own.dtype)])
-    return Shape(shape.vertices[:, np.arange(count) % present], shape.radius, weights)
+    own = jnp.ones(present, shape.vertices.dtype) if shape.counts is None else shape.counts
+    counts = jnp.concatenate([own, jnp.zeros(count - present, own.dtype)])
+    return Shape(shape.vertices[:, np.arange(count) % present], shape.radius, counts)
 
 
 def _shape(vertices, radius) -> Shape:

@@ -162,9 +162,9 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
         raise ValueError(f"tool is {type(tool).__name__}; expected a Shape")
     if before is None or tube is None:
         raise ValueError("the scene has no tool; make it with one and a path of Poses")
-    if (tool.weights is None) != (before.weights is None):
+    if (tool.counts is None) != (before.counts is None):
         raise ValueError(f"tool has corners that only fill up, or has none, unlike before: {CURE}")
-    for name in ("vertices", "radius") + (("weights",) if tool.weights is not None else ()):
+    for name in ("vertices", "radius") + (("counts",) if tool.counts is not None else ()):
         check_fits(f"tool.{name}", getattr(tool, name), getattr(before, name), CURE)
     check_sizes(geometry, float(scene.radius), tool)
     check_width(geometry, tool, scene.plan.options.half_width)

@@ -97,7 +97,7 @@ def _read(file) -> StoredSimulation:
     if tool := groups.get("tool"):
         path = Poses(tool["rotation"], tool["translation"], groups["series"].get("time"))
         if "radius" in tool:
-            names = [name for name in ("vertices", "radius", "weights") if name in tool]
+            names = [name for name in ("vertices", "radius", "counts") if name in tool]
             shape = Shape(**{name: jnp.asarray(tool[name]) for name in names})
     return StoredSimulation(
         simulation=Simulation(**series),  # pyright: ignore

@@ -154,7 +154,7 @@ def test_parts_stand_where_the_scene_says(tmp_path):
     staged = stage(SceneSpec.model_validate(SCENE | {"tool": {"parts": parts}}), tmp_path)
     tool = staged.scene.tool
     np.testing.assert_array_equal(tool.radius, [2, 0])
-    np.testing.assert_array_equal(tool.weights.sum(axis=1), [1, 8])
+    np.testing.assert_array_equal(tool.counts.sum(axis=1), [1, 8])
     np.testing.assert_array_equal(tool.vertices[0], np.tile([[-9.0], [0], [0]], 8))
     reach = np.asarray(tool.vertices[1])
     np.testing.assert_allclose(reach.max(axis=1), [6, 3, 3], atol=1e-12)
