@@ -267,11 +267,11 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
         ValueError: no part, or more than there may be; another dtype; poses that are not one a
             shape, or no rotations.
     """
-    poses = [None] * len(shapes) if poses is None else poses
-    if len(poses) != len(shapes):
-        raise ValueError(f"poses: expected one a shape ({len(shapes)}), found {len(poses)}")
+    places = [None] * len(shapes) if poses is None else list(poses)
+    if len(places) != len(shapes):
+        raise ValueError(f"poses: expected one a shape ({len(shapes)}), found {len(places)}")
     found = []
-    for i, (shape, pose) in enumerate(zip(shapes, poses, strict=True)):
+    for i, (shape, pose) in enumerate(zip(shapes, places, strict=True)):
         if pose is not None and not isinstance(pose.rotation, Tracer):
             check_rotations(f"poses: rotation of part {i}", np.asarray(pose.rotation)[None])
         found += [part if pose is None else _moved(part, pose) for part in parts_of(shape)]
