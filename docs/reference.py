@@ -82,9 +82,11 @@ TABLES = (
     ),
     (
         "Scene: [tool]",
-        "A convex shape about its own origin; capsule and cylinder along z.",
-        spec.ToolSection,
+        "A convex shape about its own origin, capsule and cylinder along z; or several parts.",
+        spec.ShapeSection,
     ),
+    ("Scene: [tool], beside its shape", "", spec.ToolSection),
+    ("Scene: [[tool.parts]]", "The keys of a shape, and:", spec.PartSection),
     (
         "Scene: [[path]]",
         "Presses (`s`, `displacement`), or motions of the tool (`start` and `end`, `positions`, or "
@@ -139,6 +141,7 @@ TYPES = {
     "tuple[Duration, ...]": ("durations", ""),
     "dict[str, ParameterSection]": ("table of tables", ""),
     "list[PathSection]": ("tables", ""),
+    "list[PartSection]": ("tables", ""),
 }
 
 

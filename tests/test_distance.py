@@ -410,7 +410,7 @@ def test_rigid_motion_of_the_frame_of_a(w, t):
     """Turning and moving A's vertices with the pose turns and moves the answer."""
     there = place(PLACES["apart"])
     motion = quick(pose_from_vector)(jnp.asarray(w), jnp.asarray(100 * t))
-    moved = Shape(quick(transform)(motion, A.vertices), A.radius)
+    moved = dataclasses.replace(A, vertices=quick(transform)(motion, A.vertices))
     one, two = solve(A, B, there), solve(moved, B, quick(compose)(motion, there))
     np.testing.assert_allclose(two.distance, one.distance, atol=1e-12)
     np.testing.assert_allclose(two.normal, motion.rotation @ one.normal, atol=1e-9)
@@ -431,7 +431,7 @@ def test_witness_points(name):
     assert c.lower <= c.upper + 1e-12
     d = np.random.default_rng(4).normal(size=(300, 3))
     d = jnp.asarray(np.vstack([d / np.linalg.norm(d, axis=1)[:, None], c.normal, -c.normal]))
-    moved = Shape(transform(there, B.vertices), B.radius)
+    moved = dataclasses.replace(B, vertices=transform(there, B.vertices))
     for shape, point, tight in ((A, c.point_a, -2), (moved, c.point_b, -1)):
         beta = jnp.asarray(1000.0 / sizes([A], [B])[0])
         room = supports(shape, d, beta).value - d @ point

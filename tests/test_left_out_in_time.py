@@ -27,7 +27,7 @@ TABLE = {
 }
 
 
-def record(trial, speed):
+def record(trial, speed, branches=(GAMMA, TAU)):
     """A ramp of 2 mm, a hold of 16 s, unloading; the force by a differential equation."""
     rise = DEPTH / speed
     corners = np.array([0, rise, rise + 16, 2 * rise + 16])
@@ -35,7 +35,7 @@ def record(trial, speed):
     parts = ((0, 21), (1, 40), (2, 15))
     t = [np.linspace(corners[i], corners[i + 1], n, endpoint=False) for i, n in parts]
     t = np.concatenate(t)
-    force, _ = maxwell.force_in_time(t, (corners, K_1 * way), GAMMA, TAU)
+    force, _ = maxwell.force_in_time(t, (corners, K_1 * way), *branches)
     force = force + np.random.default_rng(trial).normal(0, NOISE, t.size)
     D = np.interp(t, corners, way)
     return Curve("T", f"t{trial}", None, 0.0, D, force, time=t, rise=(0, 22))
@@ -142,3 +142,22 @@ def test_records_of_two_branches_choose_two_branches_by_time(records, elastic):
     text = sentence(rows, "the second half of holds")
     assert text.startswith("the data prefer prony-2 decisively")
     assert text.endswith("it predicts the second half of holds left out best)")
+
+
+@pytest.mark.slow
+def test_records_of_a_box_of_times_choose_fung():
+    """Of 40 branches, even in log tau from 0.2 to 20 s: over one branch, with the box's numbers."""
+    C, (low, high), count = 0.3, (0.2, 20.0), 40
+    width = np.log(high / low) / count
+    tau = low * np.exp(width * (np.arange(count) + 0.5))
+    made = [record(i, v, (np.full(count, C * width), tau)) for i, v in enumerate(SPEEDS)]
+    results = {word: fit(study_of(made, word), ONE) for word in ("off", "prony-1", "fung")}
+    rows, failed = compared([Model(word, result, None) for word, result in results.items()])
+    assert failed == 0
+    assert sentence(rows).startswith("the data prefer fung decisively")
+    found = results["fung"]
+    truth = {"k_1": K_1, "C": C, "tau_1": low, "tau_2": high}
+    for i, (p, _, _) in enumerate(found.study.unknowns[0]):
+        error = abs(np.log(found.value[0, i] / truth[p.name]))
+        assert error < 4 * found.relative_se[0, i], p.name
+    np.testing.assert_allclose(found.rms[0, 0], NOISE, rtol=0.15)

@@ -70,7 +70,7 @@ def solve(tool, patches, turn, at, near=2, search=False, dtype="float64"):
     for t, a in zip(*(pad(v).reshape(-1, lanes, 3) for v in (turn, at)), strict=True):
         c = solver(near, search)(*cast((tool, patches, t, a), dtype))
         assert c.gap.dtype == c.point.dtype == c.normal.dtype == c.s.dtype == dtype
-        fields = {**vars(c), "complete": c.complete}
+        fields = {k: v for k, v in vars(c).items() if v is not None} | {"complete": c.complete}
         chunks.append({k: np.asarray(v) for k, v in fields.items()})
     return SimpleNamespace(
         **{k: np.concatenate([c[k] for c in chunks])[: len(at)] for k in chunks[0]}
@@ -203,8 +203,9 @@ def test_continuous_across_borders(height):
         exact = level - R - TOOLS["sphere"].radius  # which is in both patches' reach
         assert (c.gap <= exact + 1e-12).all()
         assert (exact <= c.gap + c.bound).all()
-        if high - low < 1:  # 8 copies of the centre and two patches count alike: log 16 of log 32
-            assert (exact - c.gap > 0.79 * c.bound).all()
+        if high - low < 1:  # two patches count alike: log 2 of log 32; copies of the centre do not
+            assert (exact - c.gap > 0.19 * c.bound).all()
+            assert (exact - c.gap < 0.3 * c.bound).all()
         slope = np.diff(c.s) / step
         assert (np.abs(slope - 1) < 0.1 * (2 + abs(height)) / 2).all()
         np.testing.assert_allclose(c.phi, np.arctan2(0.6, 0.8), atol=1e-12)

@@ -215,7 +215,7 @@ def approach(
 
 def direction_table(a: Shape, settings: Settings = STANDARD) -> Float[Array, " directions"]:
     """Support of A about its centre over the coarse directions, mm; the same for every pose."""
-    centre = mean(a.vertices)
+    centre = mean(a.vertices, a.counts)
     return sharp_table(a.vertices - centre[:, None], settings.directions)
 
 
@@ -229,7 +229,7 @@ class _Scaled(eqx.Module):
 
 def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled:
     """Lengths over the size, about A's centre: translations cancel before they are rounded."""
-    centre = jax.lax.stop_gradient(mean(a.vertices))
+    centre = jax.lax.stop_gradient(mean(a.vertices, a.counts))
     turned = rotate(pose.rotation, b.vertices)
     v_a = a.vertices - centre[:, None]
     v_b = turned + (pose.translation - centre)[:, None]
@@ -237,9 +237,10 @@ def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled
     others = jnp.maximum(jnp.abs(pose.translation), jnp.abs(centre))
     v_a = _without_rounding(v_a, largest(largest(jnp.abs(a.vertices))))
     v_b = _without_rounding(v_b, largest(jnp.maximum(largest(jnp.abs(turned)), others)))
-    size = jax.lax.stop_gradient(_size(v_a, v_b, a.radius + b.radius))
+    size = jax.lax.stop_gradient(_size(v_a, v_b, b.counts, a.radius + b.radius))
     sharpness = jnp.asarray(settings.sharpness, size.dtype) if beta is None else beta * size
-    return _Scaled(Pair(v_a / size, v_b / size, sharpness), centre, size)
+    pair = Pair(v_a / size, v_b / size, sharpness, a.counts, b.counts)
+    return _Scaled(pair, centre, size)
 
 
 def _without_rounding(v, largest):
@@ -252,9 +253,9 @@ def _without_rounding(v, largest):
     return v - jax.lax.stop_gradient(jnp.where(none, v, 0))
 
 
-def _size(v_a, v_b, radius):
+def _size(v_a, v_b, counts_b, radius):
     """Sum of both half-extents; for two bare points their distance, or 1 mm where they coincide."""
-    centre_b = mean(v_b)
+    centre_b = mean(v_b, counts_b)
     extent = _reach(v_a) + _reach(v_b - centre_b[:, None]) + radius
     apart = largest(jnp.abs(centre_b))
     size = jnp.where(extent > 0, extent, apart)
@@ -270,7 +271,7 @@ def _reach(vertices):
 
 def _towards(pair: Pair):
     """Unit vector from A's centre (the origin) to B's; z where they coincide."""
-    v = mean(pair.b)
+    v = mean(pair.b, pair.counts_b)
     length = jnp.sqrt(total(v * v))
     ahead = jnp.asarray((0, 0, 1), v.dtype)
     return jnp.where(length > FLOOR, v / jnp.where(length > FLOOR, length, 1), ahead)
@@ -312,7 +313,8 @@ def _contact(a: Shape, b: Shape, scaled: _Scaled, d, tied: Array | bool = False)
     """Everything that is read off at the direction where the search stopped."""
     pair, size = scaled.pair, scaled.size
     n = _normal(pair, jax.lax.stop_gradient(d))
-    core_a, core_b = (Shape(pair.a, a.radius / size), Shape(pair.b, b.radius / size))
+    core_a = Shape(pair.a, a.radius / size, pair.counts_a)
+    core_b = Shape(pair.b, b.radius / size, pair.counts_b)
     at_a, at_b = support(core_a, n, pair.beta), support(core_b, -n, pair.beta)
     distance = -size * _minimum(pair, n) - (a.radius + b.radius)
     lower, upper = _bounds(core_a, core_b, at_a, at_b, n)

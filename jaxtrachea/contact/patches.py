@@ -10,6 +10,9 @@ centreline is one patch after another; the hollows between two borders are bridg
 with the smooth signed distances gap_i of `distance`; witness points and normal are averaged with
 the same weights. So everything stays smooth where the contact moves from one patch to the next.
 
+A tool of several convex parts (`shapes.compound`) is the sum over pairs of part and patch: where
+two parts are equally deep the contact goes from one to the other within some 1 / beta.
+
 The gap is that of the whole row up to the patches left out: `Touch.left_out` is a certified lower
 bound of theirs, from -h_A(d) - h_B(-d) <= distance, which holds for every unit vector d.
 
@@ -17,7 +20,9 @@ bound of theirs, from -h_A(d) - h_B(-d) <= distance, which holds for every unit 
 in mm.
 """
 
+import dataclasses
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,6 +44,8 @@ from jaxtrachea.status import ContactStatus
 NEARING = 6
 #: Share of a patch in the contact from which its status counts.
 COUNTS = 1e-3
+#: Share of the size by which the place may lie beside that of the deepest part of a tool.
+APART = 0.05
 
 
 class Patches(eqx.Module):
@@ -76,6 +83,7 @@ class Touch(eqx.Module):
             them is nearer.
         bound: the gap of the sharp patches is at most this larger than `gap`, mm.
         status: a `ContactStatus` as int8.
+        part: of the tool, the one with the smallest gap; None: the tool is one convex body.
     """
 
     gap: Float[Array, ""]
@@ -88,6 +96,7 @@ class Touch(eqx.Module):
     left_out: Float[Array, ""]
     bound: Float[Array, ""]
     status: Int[Array, ""]
+    part: Int[Array, ""] | None = None
 
     @property
     def complete(self) -> Bool[Array, "*lanes"]:
@@ -146,15 +155,16 @@ def touch(
     beta: Float[Array, ""] | None = None,
     search: bool = False,
 ) -> Touch:
-    """Contact of a convex tool with the tube; a pure function of one pose.
+    """Contact of a tool with the tube; a pure function of one pose.
 
     Args:
-        tool: a convex shape, of the dtype of the patches.
+        tool: a convex shape, or several (`shapes.compound`), of the dtype of the patches.
         pose: from the tool's frame to the tube's.
         patches: the tube.
         settings: accuracy and work of each signed distance.
         near: number of patches searched, those with the lowest bounds. Two are enough for tools
-            about as long as a patch; `Touch.complete` says so.
+            about as long as a patch; `Touch.complete` says so. Of a tool of several parts that of
+            pairs of part and patch.
         beta: sharpness, 1/mm; default `settings.sharpness` over the half-extents of the largest
             patch and of the tool, which counts for no more than the patch.
         search: over all directions, as `signed_distance`. Without, each patch starts from the
@@ -165,14 +175,17 @@ def touch(
 
     Returns:
         The `Touch`; differentiable in tool, pose and patches. Its gap changes with a shift of the
-        tool by the average of the patches' normals, which is `normal` but for its length.
+        tool by the average of the patches' normals, which is `normal` but for its length. Where two
+        parts of the tool are equally deep, place and normal lie between both; if that is more than
+        `APART` of the size beside the deepest, the status is FLAT.
 
     Raises:
-        ValueError: `near` is not between 1 and the number of patches.
+        ValueError: `near` is not between 1 and the number of patches (times that of parts).
     """
-    count = patches.centres.shape[0]
-    if not 1 <= near <= count:
-        raise ValueError(f"near: expected 1 to {count} (the number of patches), found {near}")
+    count, parts = patches.centres.shape[0], tool.radius.size
+    if not 1 <= near <= count * parts:
+        of = "patches" if parts == 1 else f"patches, {count}, times that of parts, {parts}"
+        raise ValueError(f"near: expected 1 to {count * parts} (the number of {of}), found {near}")
     return _touch(tool, pose, patches, settings, int(near), beta, bool(search))
 
 
@@ -187,21 +200,17 @@ def _touch(
     search: bool,
 ) -> Touch:
     """`touch`, of arguments that are checked."""
-    count = patches.centres.shape[0]
-    beta = settings.sharpness / _size(tool, patches) if beta is None else beta
-    bounds, directions = gap_bounds(tool, pose, patches)
-    # Where two patches are equally near, beside the middle one, roundings do not choose.
-    order = jnp.arange(count, dtype=bounds.dtype) / count
-    rank = bounds + LEAD * _size(tool, patches) * order
-    chosen, left = lowest(rank, near)
-    shapes = _rows_at(patches.shapes, chosen)
+    size = _size(tool, patches)
+    beta = settings.sharpness / size if beta is None else beta
+    pairs = _nearest_pairs(tool, pose, patches, near, LEAD * size)
 
-    def contact(patch, direction):
+    def contact(tool, patch, direction):
         if search:
             return signed_distance(patch, tool, pose, settings, beta=beta)
         return approach(patch, tool, pose, direction, settings, beta=beta)
 
-    each = jax.vmap(contact)(shapes, directions[chosen])
+    lanes = (None if pairs.part is None else 0, 0, 0)
+    each = jax.vmap(contact, lanes)(pairs.tools, pairs.shapes, pairs.directions)
     low = jax.lax.stop_gradient(-largest(-each.distance))
     e = jnp.exp(-beta * (each.distance - low))
     whole = total(e)
@@ -213,28 +222,77 @@ def _touch(
 
     point = mean(each.point_a)
     s, phi = skeleton_coordinates(patches.line, point)
-    terms = patches.shapes.vertices.shape[2] * tool.vertices.shape[1] * near
-    worst = jnp.max(jnp.where(weight > COUNTS, each.status, 0))
+    terms = patches.shapes.vertices.shape[2] * tool.vertices.shape[-1] * near
+    deepest, counts = jnp.argmin(each.distance), weight > COUNTS
+    worst = jnp.max(jnp.where(counts, each.status, 0))
+    if pairs.part is not None:
+        away = point - each.point_a[deepest]
+        tied = total(away * away) > (APART * size) ** 2
+        worst = jnp.where(tied, jnp.maximum(worst, ContactStatus.FLAT), worst)
     if patches.uncertain is not None:
-        doubt = jnp.any((weight > COUNTS) & patches.uncertain[chosen])
+        doubt = jnp.any(counts & patches.uncertain[pairs.patch])
         worst = jnp.where(doubt, jnp.maximum(worst, ContactStatus.NOT_CONVERGED), worst)
     if not search:
-        deep = gap < -(tool.radius + jnp.min(shapes.radius))
+        rounded = (
+            tool.radius
+            if pairs.part is None
+            else jnp.min(jnp.where(counts, pairs.tools.radius, jnp.inf))
+        )
+        deep = gap < -(rounded + jnp.min(pairs.shapes.radius))
         worst = jnp.where(deep, jnp.maximum(worst, ContactStatus.NOT_CONVERGED), worst)
     # Also the patches that are not searched: else which one is nearest is not known.
-    finite = jnp.isfinite(gap) & jnp.all(jnp.isfinite(bounds))
+    finite = jnp.isfinite(gap) & jnp.all(jnp.isfinite(pairs.bounds))
     return Touch(
-        gap,
-        point,
-        mean(each.point_b),
-        _unit(mean(each.normal)),
-        s,
-        phi,
-        chosen[jnp.argmin(each.distance)],
-        jnp.min(jnp.where(left, bounds, jnp.inf)),
-        jax.lax.stop_gradient(jnp.log(jnp.asarray(terms, gap.dtype)) / beta),
-        jnp.where(finite, worst, ContactStatus.NON_FINITE).astype(jnp.int8),
-    )
+        gap=gap, point=point, tool_point=mean(each.point_b), normal=_unit(mean(each.normal)), s=s,
+        phi=phi, patch=pairs.patch[deepest],
+        left_out=jnp.min(jnp.where(pairs.left, pairs.bounds, jnp.inf)),
+        bound=jax.lax.stop_gradient(jnp.log(jnp.asarray(terms, gap.dtype)) / beta),
+        status=jnp.where(finite, worst, ContactStatus.NON_FINITE).astype(jnp.int8),
+        part=None if pairs.part is None else pairs.part[deepest],
+    )  # fmt: skip
+
+
+class _Pairs(NamedTuple):
+    """Patches that a tool, or one of its parts, is nearest to.
+
+    Attributes:
+        patch: number of each; shape (near,).
+        part: of the tool, of each; None: it has one, and `tools` is the tool itself.
+        shapes: the patches.
+        tools: the parts.
+        directions: to start from; shape (near, 3).
+        bounds: lower bound of the gap of all pairs, mm; shape (pairs,).
+        left: which of those are not among the nearest.
+    """
+
+    patch: Int[Array, " near"]
+    part: Int[Array, " near"] | None
+    shapes: Shape
+    tools: Shape
+    directions: Float[Array, "near 3"]
+    bounds: Float[Array, " pairs"]
+    left: Bool[Array, " pairs"]
+
+
+def _nearest_pairs(tool: Shape, pose: Pose, patches: Patches, near: int, lead) -> _Pairs:
+    """By the broad phase; of all pairs the last one stands back by `lead` (mm) behind the first.
+
+    So where two patches are equally near, beside the middle one, roundings do not choose.
+    """
+    count, alone = patches.centres.shape[0], tool.radius.ndim == 0
+    if alone:
+        bounds, directions = gap_bounds(tool, pose, patches)
+    else:
+        bounds, directions = jax.vmap(lambda part: gap_bounds(part, pose, patches))(tool)
+        bounds, directions = bounds.reshape(-1), directions.reshape(-1, 3)
+    pairs = bounds.shape[0]
+    rank = bounds + lead * (jnp.arange(pairs, dtype=bounds.dtype) / pairs)
+    chosen, left = lowest(rank, near)
+    part = None if alone else jax.lax.div(chosen, jnp.asarray(count, chosen.dtype))
+    patch = chosen if part is None else chosen - count * part
+    tools = tool if part is None else _rows_at(tool, part)
+    shapes = _rows_at(patches.shapes, patch)
+    return _Pairs(patch, part, shapes, tools, directions[chosen], bounds, left)
 
 
 def gap_bounds(
@@ -245,10 +303,10 @@ def gap_bounds(
     Roughly that between the nearest points of the cores. Not differentiable.
     """
     tool, pose, patches = jax.lax.stop_gradient((tool, pose, patches))
-    moved = Shape(transform(pose, tool.vertices), tool.radius)
+    moved = dataclasses.replace(tool, vertices=transform(pose, tool.vertices))
 
     def bound(patch, centre):
-        z = middle(moved.vertices) - centre
+        z = middle(moved.vertices, moved.counts) - centre
         for _ in range(NEARING):  # Frank-Wolfe on the difference of the cores, exact steps
             # Of vertices equally far (flat faces), a fixed one: roundings would choose others.
             ahead = z + LEAD * largest(jnp.abs(z)) * jnp.asarray(PREFERRED, z.dtype)
@@ -272,9 +330,10 @@ def _furthest(vertices, direction):
 
 
 def _rows_at(shapes: Shape, chosen) -> Shape:
-    """Some of the patches. By rows: XLA runs a program of arrays of at most 512 bytes in order."""
+    """Some of the shapes. By rows: XLA runs a program of arrays of at most 512 bytes in order."""
     rows = [shapes.vertices[:, i][chosen] for i in range(3)]
-    return Shape(jnp.stack(rows, axis=1), shapes.radius[chosen])
+    counts = None if shapes.counts is None else shapes.counts[chosen]
+    return Shape(jnp.stack(rows, axis=1), shapes.radius[chosen], counts)
 
 
 def _unit(v):
@@ -288,13 +347,21 @@ def _size(tool: Shape, patches: Patches):
     """Half-extents of the largest patch and of a tool up to as large, mm; not differentiable.
 
     A larger tool is met on no more of its length than a patch: it does not blur the contact more.
+    Of several parts the largest counts.
     """
     tool, shapes = jax.lax.stop_gradient((tool, patches.shapes))
 
-    def reach(v):
+    def reach(shape):
         # Axis by axis: sums of fewer entries, which may be in one kernel.
-        x, y, z = ((row - total(row) / row.shape[0]) ** 2 for row in v)
-        return jnp.sqrt(largest(x + y + z))
+        x, y, z = ((row - middle(row, shape.counts)) ** 2 for row in shape.vertices)
+        return jnp.sqrt(largest(x + y + z)) + shape.radius
 
-    patch = jnp.max(jax.vmap(reach)(shapes.vertices) + shapes.radius)
-    return patch + jnp.minimum(reach(tool.vertices) + tool.radius, patch)
+    def middle(row, counts):
+        if counts is not None:
+            own = (counts > 0).astype(row.dtype)
+            return total(row * own) / total(own)
+        return total(row) / row.shape[0]
+
+    patch = jnp.max(jax.vmap(reach)(shapes))
+    own = reach(tool) if tool.radius.ndim == 0 else jnp.max(jax.vmap(reach)(tool))
+    return patch + jnp.minimum(own, patch)

@@ -119,12 +119,15 @@ LEVELS = {"fast": FAST, "standard": STANDARD, "fine": FINE}
 class Pair(NamedTuple):
     """Vertices of both shapes in one frame, and the sharpness; all dimensionless.
 
-    Radii are constants on the sphere of directions and take no part in the search.
+    Radii are constants on the sphere of directions and take no part in the search. How often each
+    vertex counts: see `Shape.counts`.
     """
 
     a: Float[Array, "3 n"]
     b: Float[Array, "3 m"]
     beta: Float[Array, ""]
+    counts_a: Float[Array, " n"] | None = None
+    counts_b: Float[Array, " m"] | None = None
 
 
 class Model(NamedTuple):
@@ -147,13 +150,13 @@ def tangents(d: Float[Array, "3"]):
     return first, jnp.stack([b, sign + d[1] * d[1] * a, -d[1]])
 
 
-def _moments(vertices, beta, d, e1, e2):
+def _moments(vertices, counts, beta, d, e1, e2):
     """Support value, softmax means along (d, e1, e2), and beta times the tangent covariance."""
     along, s1, s2 = heights(vertices, d), heights(vertices, e1), heights(vertices, e2)
     if vertices.shape[1] == 1:  # a ball
         none = jnp.zeros_like(beta)
         return along[0], along[0], (s1[0], s2[0]), (none, none, none)
-    value, p = log_mean(along, beta)
+    value, p = log_mean(along, beta, counts)
     m1, m2 = total(p * s1), total(p * s2)
     r1, r2 = s1 - m1, s2 - m2
     spread = (total(p * r1 * r1), total(p * r1 * r2), total(p * r2 * r2))
@@ -163,8 +166,8 @@ def _moments(vertices, beta, d, e1, e2):
 def model(pair: Pair, d: Float[Array, "3"]) -> Model:
     """Second-order model of f at d on the sphere: Hessian = beta cov - (mean . d) I."""
     e1, e2 = tangents(d)
-    h_a, m_a, g_a, c_a = _moments(pair.a, pair.beta, d, e1, e2)
-    h_b, m_b, g_b, c_b = _moments(pair.b, pair.beta, -d, e1, e2)
+    h_a, m_a, g_a, c_a = _moments(pair.a, pair.counts_a, pair.beta, d, e1, e2)
+    h_b, m_b, g_b, c_b = _moments(pair.b, pair.counts_b, pair.beta, -d, e1, e2)
     bend = m_a + m_b
     hessian = (c_a[0] + c_b[0] - bend, c_a[1] + c_b[1], c_a[2] + c_b[2] - bend)
     return Model(h_a + h_b, (g_a[0] - g_b[0], g_a[1] - g_b[1]), hessian)

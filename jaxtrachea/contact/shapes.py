@@ -10,12 +10,16 @@ The smoothed shape therefore contains the sharp one and sticks out by at most lo
 boundary point with normal d is the gradient of h continued homogeneously,
 x(d) = sum_i p_i v_i + (H(p)/beta + r) d, with the softmax weights p and their entropy H(p).
 
+A vertex may count 0 times in the sum: so shapes of unlike numbers of vertices are stacked, and the
+smoothed shape stays what it is. A body that is not convex is a stack of convex parts (`compound`).
+
 Source: smoothing of a maximum by its entropic conjugate, Nesterov, "Smooth minimization of
 non-smooth functions", Math. Program. 103 (2005), doi:10.1007/s10107-004-0552-5.
 
 Vertices are stored as three rows (3, N), so that everything stays elementwise. Lengths in mm.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -28,6 +32,7 @@ from jax.typing import ArrayLike as _ArrayLike
 from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import largest, total
+from jaxtrachea.contact.pose import Pose, check_rotations, transform
 
 #: Numbers, arrays and nested lists of them.
 ArrayLike = _ArrayLike | Sequence
@@ -35,20 +40,26 @@ ArrayLike = _ArrayLike | Sequence
 FLAT = 1e-5
 #: Thickness over length of a hull from which on that is looked for: thin plates would lose sides.
 THIN = 0.01
+#: Convex parts of a tool at most: the cost of a contact grows with them.
+MAX_PARTS = 32
 
 
 class Shape(eqx.Module):
     """A convex hull of vertices, swept by a ball.
 
-    Interior, repeated, collinear or coplanar vertices are allowed.
+    Interior, repeated, collinear or coplanar vertices are allowed. With a leading axis it is a
+    tool of several convex parts (`compound`), or the patches of a wall.
 
     Attributes:
         vertices: mm, one row per coordinate; shape (3, n).
         radius: of the ball, mm, not negative.
+        counts: whether each vertex counts in the smoothed sum, shape (n,): 0 for one that repeats
+            another to fill up (`padded`), positive for the others; None: all do.
     """
 
     vertices: Float[Array, "*lanes 3 n"]
     radius: Float[Array, "*lanes"]
+    counts: Float[Array, "*lanes n"] | None = None
 
 
 class Support(eqx.Module):
@@ -74,7 +85,7 @@ def support(shape: Shape, direction: Float[Array, "3"], beta: Float[Array, ""]) 
         beta: sharpness, 1/mm, positive. The bias is at most log(n) / beta.
     """
     along = heights(shape.vertices, direction)
-    value, weights = log_mean(along, beta)
+    value, weights = log_mean(along, beta, shape.counts)
     core = total(shape.vertices * weights[None])
     beyond = value - total(weights * along) + shape.radius
     return Support(value + shape.radius, core + beyond * direction, core)
@@ -86,18 +97,26 @@ def heights(vertices: Float[Array, "3 n"], direction: Float[Array, "3"]) -> Floa
     return x * direction[0] + y * direction[1] + z * direction[2]
 
 
-def log_mean(along: Float[Array, " n"], beta: Float[Array, ""]):
-    """(1/beta) log sum exp(beta x) and the softmax weights, without overflow."""
+def log_mean(
+    along: Float[Array, " n"],
+    beta: Float[Array, ""],
+    counts: Float[Array, " n"] | None = None,
+):
+    """(1/beta) log sum exp(beta x) of what counts and the softmax weights, without overflow."""
     if along.shape[0] == 1:  # a ball
         return along[0], jnp.ones_like(along)
     top = jax.lax.stop_gradient(largest(along))
     e = jnp.exp(beta * (along - top))
+    e = e if counts is None else jnp.where(counts > 0, e, 0)
     whole = total(e)
     return top + jnp.log(whole) / beta, e / whole
 
 
-def mean(vertices: Float[Array, "3 n"]) -> Float[Array, "3"]:
-    """Mean of the vertices, mm."""
+def mean(vertices: Float[Array, "3 n"], counts: Float[Array, " n"] | None = None):
+    """Mean of the vertices that count, mm; shape (3,)."""
+    if counts is not None:
+        own = (counts > 0).astype(vertices.dtype)
+        return total(vertices * own[None]) / total(own)
     return total(vertices) / vertices.shape[1]
 
 
@@ -107,10 +126,11 @@ def sharp_support(shape: Shape, direction: Float[Array, "3"]) -> Float[Array, ""
 
 
 def cloud(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
-    """The hull of points, swept by a ball; every point is kept as a vertex.
+    """The hull of points, swept by a ball; every point is kept as a vertex, equal ones once.
 
     Args:
-        points: mm; shape (n, 3) with n >= 1 (a list, numpy or JAX array; may be traced).
+        points: mm; shape (n, 3) with n >= 1 (a list, numpy or JAX array). They may be traced:
+            equal ones then count as often as they are there, log(that) / beta of the surface.
         radius: mm, not negative.
         dtype: of the shape; default the dtype of `points`, or JAX's default for numbers.
 
@@ -120,6 +140,9 @@ def cloud(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
     vertices = jnp.asarray(points, dtype)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.shape[0] == 0:
         raise ValueError(f"points: expected shape (n, 3) with n >= 1, found {vertices.shape}")
+    if not isinstance(vertices, Tracer):
+        _, first = np.unique(np.asarray(vertices) + 0.0, axis=0, return_index=True)
+        vertices = vertices[np.sort(first)]
     return _shape(vertices.T, radius)
 
 
@@ -229,10 +252,67 @@ def cylinder(
     return _shape(jnp.stack([x, y, z]), radius)
 
 
-def padded(shape: Shape, count: int) -> Shape:
-    """The same sharp shape with its vertices repeated in turn up to `count` of them.
+def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Shape:
+    """A tool of several convex parts: forceps, a hook; their surface is that of all together.
 
-    For stacking shapes under `vmap`. The smoothed shape grows, within the bound log(count) / beta.
+    Args:
+        shapes: of one dtype; one that has parts itself gives them all. At most `MAX_PARTS` parts.
+        poses: of each in the frame of the tool, rotations (checked where they are not traced);
+            None: the shapes have that frame.
+
+    Returns:
+        The parts, stacked: vertices (parts, 3, n), radius (parts,), counts (parts, n) or None.
+
+    Raises:
+        ValueError: no part, or more than there may be; another dtype; poses that are not one a
+            shape, or no rotations.
+    """
+    places = [None] * len(shapes) if poses is None else list(poses)
+    if len(places) != len(shapes):
+        raise ValueError(f"poses: expected one a shape ({len(shapes)}), found {len(places)}")
+    found = []
+    for i, (shape, pose) in enumerate(zip(shapes, places, strict=True)):
+        if pose is not None and not isinstance(pose.rotation, Tracer):
+            check_rotations(f"poses: rotation of part {i}", np.asarray(pose.rotation)[None])
+        found += [part if pose is None else _moved(part, pose) for part in parts_of(shape)]
+    if not 1 <= len(found) <= MAX_PARTS:
+        raise ValueError(f"shapes: expected 1 to {MAX_PARTS} convex parts, found {len(found)}")
+    dtype = found[0].vertices.dtype
+    for i, part in enumerate(found):
+        if part.vertices.dtype != dtype:
+            raise ValueError(
+                f"shapes: part {i} is {part.vertices.dtype}; expected {dtype}, as the first"
+            )
+    most = max(part.vertices.shape[1] for part in found)
+    if any(part.vertices.shape[1] < most or part.counts is not None for part in found):
+        found = [padded(part, most) for part in found]
+    return jax.tree.map(lambda *v: jnp.stack(v), *found)
+
+
+def parts_of(shape: Shape) -> list[Shape]:
+    """The convex parts of a tool, each with its own vertices: itself, if it has no others."""
+    if shape.vertices.ndim == 2:
+        return [shape]
+    parts = [jax.tree.map(lambda v, i=i: v[i], shape) for i in range(len(shape.radius))]
+    return [_unpadded(part) for part in parts]
+
+
+def _unpadded(shape: Shape) -> Shape:
+    """Without the vertices that do not count, where that is known."""
+    if shape.counts is None or isinstance(shape.counts, Tracer):
+        return shape
+    return Shape(shape.vertices[:, np.asarray(shape.counts) > 0], shape.radius)
+
+
+def _moved(shape: Shape, pose: Pose) -> Shape:
+    """A shape in another frame."""
+    return dataclasses.replace(shape, vertices=transform(pose, shape.vertices))
+
+
+def padded(shape: Shape, count: int) -> Shape:
+    """The same shape with vertices repeated up to `count` of them, which do not count.
+
+    For stacking shapes under `vmap`.
 
     Args:
         shape: a convex shape.
@@ -244,7 +324,9 @@ def padded(shape: Shape, count: int) -> Shape:
     present = shape.vertices.shape[1]
     if count < present:
         raise ValueError(f"count: expected at least {present} (the vertices), found {count}")
-    return Shape(shape.vertices[:, np.arange(count) % present], shape.radius)
+    own = jnp.ones(present, shape.vertices.dtype) if shape.counts is None else shape.counts
+    counts = jnp.concatenate([own, jnp.zeros(count - present, own.dtype)])
+    return Shape(shape.vertices[:, np.arange(count) % present], shape.radius, counts)
 
 
 def _shape(vertices, radius) -> Shape:

@@ -27,9 +27,11 @@ from jaxtrachea._numerics import epsilon, product
 from jaxtrachea.mechanics._matrix2 import apply, solve
 from jaxtrachea.mechanics.equilibrium import press_series
 from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.roots import newton_tolerance
 from jaxtrachea.mechanics.vector_equilibrium import press_vector
 from jaxtrachea.status import PressStatus
 
+#: Newton steps to the friction cone at most; 3 to 5 are usual.
 _ITERATIONS = 12
 
 
@@ -200,7 +202,7 @@ def _on_cone(sliding, D, compliance, law: Law, mu) -> _OnCone:
     is computed as another one that has, so that no derivative is NaN because of it.
     """
     still = jax.lax.stop_gradient((D, compliance, law, mu))
-    z = _cone_root(*still)
+    z = _cone_root(jax.lax.stop_gradient(sliding), *still)
     force, depth, pressed = _at_root(z, *still)
     normal, tangential = force[0], jnp.linalg.norm(force[1:])
     tolerance = epsilon(D.dtype) ** 0.5
@@ -251,8 +253,11 @@ def _excess(z, D, C, law: Law, mu):
     return N * z / jnp.linalg.norm(h) - 1
 
 
-def _cone_root(D, C, law: Law, mu):
-    """Root z of `_excess`: Newton from the frictionless tangent, kept in a shrinking bracket."""
+def _cone_root(sliding, D, C, law: Law, mu):
+    """Root z of `_excess`: Newton from the frictionless tangent, kept in a shrinking bracket.
+
+    It ends where z stands still, and does not begin where nothing slides (any number then).
+    """
     low = mu / law.stiffest(jnp.sum(D * D))  # no softer than sticking
     N, w, _ = _given_mobility(jnp.full_like(mu, jnp.inf), D, C, law, mu)
     length = jnp.linalg.norm(w)
@@ -261,16 +266,22 @@ def _cone_root(D, C, law: Law, mu):
     def excess(z):
         return _excess(z, D, C, law, mu)
 
-    def newton(_, state):
-        z, low, high = state
+    def moves(state):
+        count, moving = state[:2]
+        return moving & (count < _ITERATIONS)
+
+    def newton(state):
+        count, _, z, low, high = state
         value, slope = jax.jvp(excess, (z,), (jnp.ones_like(z),))
         low, high = jnp.where(value < 0, z, low), jnp.where(value < 0, high, z)
         new = z - value / slope
         middle = jnp.where(jnp.isfinite(high), (low + high) / 2, 2 * z)
-        return jnp.where((new >= low) & (new <= high), new, middle), low, high
+        new = jnp.where((new >= low) & (new <= high), new, middle)
+        return count + 1, ~(jnp.abs(new - z) <= still * z), new, low, high
 
-    start = jnp.maximum(first, low), low, jnp.full_like(low, jnp.inf)
-    return jax.lax.fori_loop(0, _ITERATIONS, newton, start)[0]
+    still = newton_tolerance(low.dtype)
+    start = jnp.asarray(0), sliding, jnp.maximum(first, low), low, jnp.full_like(low, jnp.inf)
+    return jax.lax.while_loop(moves, newton, start)[2]
 
 
 @jax.custom_jvp

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxtrachea._arguments import check_fits, check_word
 from jaxtrachea.contact.search import STANDARD
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.mechanics.sections.wall import Points, gather_points
@@ -123,7 +123,10 @@ def _footprint(tool: Shape | None, outer: float) -> float:
     least = LEAST * (outer / OUTER)
     if tool is None:
         return least
-    extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
+    extent = max(
+        np.ptp(np.asarray(part.vertices), axis=1).min() / 2 + float(part.radius)
+        for part in parts_of(tool)
+    )
     return max(FOOTPRINT * extent, least)
 
 
@@ -150,8 +153,8 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
     """The scene with a tool of another size (concrete numbers) and the same program.
 
     Raises:
-        ValueError: more or fewer corners than the tool before, another dtype, or so large that the
-            program searches too few patches or moves too few vertices.
+        ValueError: more or fewer corners or parts than the tool before, another dtype, or so large
+            that the program searches too few patches or moves too few vertices.
         SizeError: larger than any tool, or smaller than its width (`half_width`).
     """
     before, tube, geometry = scene.tool, scene.tube, scene.geometry
@@ -159,7 +162,9 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
         raise ValueError(f"tool is {type(tool).__name__}; expected a Shape")
     if before is None or tube is None:
         raise ValueError("the scene has no tool; make it with one and a path of Poses")
-    for name in ("vertices", "radius"):
+    if (tool.counts is None) != (before.counts is None):
+        raise ValueError(f"tool has corners that only fill up, or has none, unlike before: {CURE}")
+    for name in ("vertices", "radius") + (("counts",) if tool.counts is not None else ()):
         check_fits(f"tool.{name}", getattr(tool, name), getattr(before, name), CURE)
     check_sizes(geometry, float(scene.radius), tool)
     check_width(geometry, tool, scene.plan.options.half_width)

@@ -5,12 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
+from jaxtrachea.contact.pose import pose_from_vector
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
@@ -31,7 +33,7 @@ from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.paths import named_file, path_of, read_table
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
-from jaxtrachea.scene.spec import NEEDED, SceneSpec, SceneTracheaSection, ToolSection
+from jaxtrachea.scene.spec import NEEDED, SceneSpec, SceneTracheaSection, ShapeSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
 from jaxtrachea.scene.tool_file import read_tool
 from jaxtrachea.trachea.geometry import Geometry
@@ -89,7 +91,7 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         mesh = _tube(spec.trachea, geometry, material)
     tool = None
     if spec.tool is not None:
-        shape, seen = _shape(spec.tool, folder, files)
+        shape, seen = _tool(spec.tool, folder, files)
         tool, notes = Tool(shape, spec.tool.friction), notes + seen
     path = path_of(spec, folder, files, geometry)
     material = relaxing(spec, material, path)
@@ -287,10 +289,29 @@ def _of_file(error: InputError) -> SpecError:
     return SpecError.like(named, place="", key=key, joint=named.joint if named.key else ": ")
 
 
-def _shape(
+def _tool(
     section: ToolSection, folder: Path, files: list[Path]
 ) -> tuple[shapes.Shape, tuple[str, ...]]:
-    """The tool, and notes on its file."""
+    """The shape of the tool, its parts where they stand, and notes on their files."""
+    if section.parts is None:
+        return _shape(section, "tool", folder, files)
+    found, poses, notes = [], [], ()
+    for i, part in enumerate(section.parts):
+        shape, seen = _shape(part, f"tool.parts.{i}", folder, files)
+        turn, place = part.rotation or [0.0] * 3, part.position or [0.0] * 3
+        found.append(jax.tree.map(lambda v: jnp.asarray(v, float), shape))
+        poses.append(pose_from_vector(jnp.asarray(turn, float), jnp.asarray(place, float)))
+        notes += seen
+    try:
+        return shapes.compound(found, poses), notes
+    except ValueError as error:
+        raise SpecError(str(error).replace("shapes:", "tool.parts:", 1)) from None
+
+
+def _shape(
+    section: ShapeSection, key: str, folder: Path, files: list[Path]
+) -> tuple[shapes.Shape, tuple[str, ...]]:
+    """A shape of the specification, and notes on its file."""
     rounding, radius = section.rounding or 0.0, section.radius or 0.0
     half = (section.length or 0.0) / 2
     if section.shape == "sphere":
@@ -301,13 +322,14 @@ def _shape(
         return shapes.cylinder(half, radius, rounding, dtype=float), ()
     if section.shape == "box":
         return shapes.box(np.asarray(section.size) / 2, rounding), ()
-    path = named_file(folder, section.file or "", "tool.file", files)
+    path = named_file(folder, section.file or "", f"{key}.file", files)
     if section.shape == "cloud":
-        points = np.stack(list(read_table(path, "tool.file", ("x", "y", "z"), {}).values()), axis=1)
+        table = read_table(path, f"{key}.file", ("x", "y", "z"), {})
+        points = np.stack(list(table.values()), axis=1)
         return shapes.hull(points, rounding), ()
     try:
         shape, note = read_tool(path, section.unit, rounding)
     except MeshError as error:
-        key = f"tool.{error.key}" if error.key else f"tool.file: {path.name}"
-        raise SpecError.like(error, place="", key=key) from None
+        place = error.key if error.key else f"file: {path.name}"
+        raise SpecError.like(error, place="", key=f"{key}.{place}") from None
     return shape, (note,)

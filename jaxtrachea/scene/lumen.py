@@ -34,8 +34,8 @@ class Whereabouts(NamedTuple):
         known: the pose and its contact are finite.
         off: the contact lies beyond an end, or on a face that closes it.
         clear: the tool does not touch.
-        within: all of it lies within the inner wall.
-        centred: its middle lies within the middle of the wall.
+        within: all of it, or of one of its parts, lies within the inner wall.
+        centred: its middle, or that of one of its parts, lies within the middle of the wall.
     """
 
     known: Bool[Array, " rows"]
@@ -57,17 +57,25 @@ def whereabouts(scene: Scene, path: Poses, seen: Touch) -> Whereabouts:
     gap = jax.lax.stop_gradient(seen.gap)
     wall = 2 * jnp.maximum(scene.radius - scene.geometry.radius, 0)
     room = scene.radius - wall - scene.tool.radius
-    corners = product(path.rotation, scene.tool.vertices) + path.translation[:, :, None]
     line = scene.tube.line if scene.plan.curved else None
     off_axis = jax.vmap(functools.partial(_off_axis, line))
-    square = jax.vmap(off_axis, 2, 1)(corners)
+
+    def look(vertices, room):
+        corners = product(path.rotation, vertices) + path.translation[:, :, None]
+        square = jax.vmap(off_axis, 2, 1)(corners)
+        within = (jnp.max(square, axis=1) < room * room) & (room > 0)
+        centred = off_axis(jnp.mean(corners, axis=2)) < (scene.radius - wall / 2) ** 2
+        return jnp.sum(corners, axis=(1, 2)), within, centred
+
+    if scene.tool.radius.ndim == 0:
+        finite, within, centred = look(scene.tool.vertices, room)
+    else:  # one part in the lumen is enough
+        each = jax.vmap(look)(scene.tool.vertices, room)
+        finite, within, centred = jnp.sum(each[0], 0), jnp.any(each[1], 0), jnp.any(each[2], 0)
     return Whereabouts(
-        known=jnp.isfinite(jnp.sum(corners, axis=(1, 2)) + gap),
-        off=off_the_end(scene, seen),
-        clear=gap >= 0,
-        within=(jnp.max(square, axis=1) < room * room) & (room > 0),
-        centred=off_axis(jnp.mean(corners, axis=2)) < (scene.radius - wall / 2) ** 2,
-    )
+        known=jnp.isfinite(finite + gap), off=off_the_end(scene, seen), clear=gap >= 0,
+        within=within, centred=centred,
+    )  # fmt: skip
 
 
 def next_side(side: Int[Array, ""], at: Whereabouts) -> Int[Array, ""]:

@@ -171,5 +171,6 @@ def contact_share(scene: Scene, seen: Touch):
     """Penetration against what the search for a contact is sure of: radii of tool and patches."""
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
-    sure = scene.tool.radius + jnp.min(scene.tube.shapes.radius)
+    own = scene.tool.radius if seen.part is None else scene.tool.radius[seen.part]
+    sure = own + jnp.min(scene.tube.shapes.radius)
     return jax.lax.stop_gradient(jnp.maximum(-seen.gap, 0) / jnp.where(sure > 0, sure, jnp.nan))

@@ -97,7 +97,8 @@ def _read(file) -> StoredSimulation:
     if tool := groups.get("tool"):
         path = Poses(tool["rotation"], tool["translation"], groups["series"].get("time"))
         if "radius" in tool:
-            shape = Shape(jnp.asarray(tool["vertices"]), jnp.asarray(tool["radius"]))
+            names = [name for name in ("vertices", "radius", "counts") if name in tool]
+            shape = Shape(**{name: jnp.asarray(tool[name]) for name in names})
     return StoredSimulation(
         simulation=Simulation(**series),  # pyright: ignore
         units={n: file["series"][n].attrs["units"] for n, v in series.items() if v is not None},

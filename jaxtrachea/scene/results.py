@@ -61,6 +61,8 @@ def write_simulation(
             if scene.tool is not None:
                 tool.create_dataset("vertices", data=scene.tool.vertices).attrs["units"] = "mm"
                 tool.create_dataset("radius", data=scene.tool.radius).attrs["units"] = "mm"
+                if scene.tool.counts is not None:
+                    tool.create_dataset("counts", data=scene.tool.counts).attrs["units"] = "1"
         _write_rings(file.create_group("rings"), scene)
         _write_material(file.create_group("material"), material)
         if scene.mesh is not None:

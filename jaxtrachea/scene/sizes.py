@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.tube import WALL
 
@@ -46,8 +46,8 @@ def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
             joint=" ",
         )
     if tool is not None:
-        corners = np.asarray(tool.vertices, float)
-        across = float(np.ptp(corners, axis=1).max() + 2 * float(tool.radius))
+        low, high = extents(tool)
+        across = float((high - low).max())
         if not across <= LONGEST_TOOL:
             raise SizeError(
                 f"is {across:.4g} mm across",
@@ -71,9 +71,7 @@ def check_width(geometry: Geometry, tool: Shape | None, half_width: float) -> No
     """
     most, of = float(geometry.length) / 2, "half the length of the tube"
     if tool is not None:
-        corners = np.asarray(tool.vertices, float)
-        far = np.sqrt(np.sum((corners - corners.mean(1, keepdims=True)) ** 2, axis=0)).max()
-        reach = float(far) + float(tool.radius)
+        reach = max(_reach(part) for part in parts_of(tool))
         most, of = min((most, of), (reach, "as far as the tool reaches from its middle"))
     if half_width > most:
         raise SizeError(
@@ -81,6 +79,20 @@ def check_width(geometry: Geometry, tool: Shape | None, half_width: float) -> No
             expected=f"at most {most:.4g} mm, {of}",
             cure="of a flat round end it is pi/4 of the radius",
         )  # fmt: skip
+
+
+def extents(tool: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates of a tool, with its rounding, mm; shape (3,) each."""
+    parts = [(np.asarray(p.vertices, float), float(p.radius)) for p in parts_of(tool)]
+    low = np.min([corners.min(axis=1) - radius for corners, radius in parts], axis=0)
+    return low, np.max([corners.max(axis=1) + radius for corners, radius in parts], axis=0)
+
+
+def _reach(part: Shape) -> float:
+    """How far a convex body reaches from its middle, mm."""
+    corners = np.asarray(part.vertices, float)
+    away = corners - corners.mean(axis=1, keepdims=True)
+    return float(np.sqrt(np.sum(away**2, axis=0)).max()) + float(part.radius)
 
 
 def _within(name: str, value: float, limits: tuple[float, float]) -> None:

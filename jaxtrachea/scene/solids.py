@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import Shape, parts_of
 
 #: Directions on the sphere: a ball of 5 mm is drawn within 0.03 mm.
 DIRECTIONS = 600
@@ -59,19 +59,27 @@ def sphere_directions(count: int = DIRECTIONS) -> Float[np.ndarray, "count 3"]:
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
 
 
-def tool_triangles(shape: Shape, count: int = DIRECTIONS) -> Triangles:
-    """The surface of a convex tool about its own origin.
+def tool_triangles(tool: Shape, count: int = DIRECTIONS) -> Triangles:
+    """The surfaces of a tool's convex parts about its own origin.
 
-    It is the hull of the support points in `count` directions, so it lies inside the tool by at
+    Each is the hull of the support points in `count` directions, so it lies inside the tool by at
     most 1 - cos of half the angle between directions, times the radius.
 
     Args:
-        shape: a tool with a volume.
+        tool: each part with a volume.
         count: directions.
 
     Raises:
-        scipy.spatial.QhullError: the tool is a point, a line or a plate without a radius.
+        scipy.spatial.QhullError: a part is a point, a line or a plate without a radius.
     """
+    parts = [_triangles(part, count) for part in parts_of(tool)]
+    shift = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + at for part, at in zip(parts, shift, strict=True)]
+    return Triangles(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+
+
+def _triangles(shape: Shape, count: int) -> Triangles:
+    """The surface of one convex body."""
     from scipy.spatial import ConvexHull
 
     corners, radius = np.asarray(shape.vertices, float).T, float(shape.radius)
@@ -88,17 +96,23 @@ def tool_triangles(shape: Shape, count: int = DIRECTIONS) -> Triangles:
     return Triangles(vertices, faces)
 
 
-def tool_distance(shape: Shape, points: np.ndarray, count: int = 4000) -> np.ndarray:
-    """Signed distance of points from a convex tool about its own origin, mm; negative inside.
+def tool_distance(tool: Shape, points: np.ndarray, count: int = 4000) -> np.ndarray:
+    """Signed distance of points from a tool about its own origin, mm; negative inside.
 
-    It is the largest of d . x - h(d) over directions d, with the support function h: the normals of
-    the faces and `count` others. The error is below a hundredth of the tool's size.
+    Of each convex part it is the largest of d . x - h(d) over directions d, with the support
+    function h: the normals of the faces and `count` others. The error is below a hundredth of the
+    part's size.
 
     Args:
-        shape: the tool.
+        tool: -
         points: in its frame; shape (points, 3).
         count: directions.
     """
+    return np.min([_distance(part, points, count) for part in parts_of(tool)], axis=0)
+
+
+def _distance(shape: Shape, points: np.ndarray, count: int) -> np.ndarray:
+    """`tool_distance` of one convex body."""
     from scipy.spatial import ConvexHull, QhullError
 
     ways, corners = sphere_directions(count), np.asarray(shape.vertices, float)

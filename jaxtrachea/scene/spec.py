@@ -20,6 +20,7 @@ from jaxtrachea.config import (
     load_spec,
     quantity,
 )
+from jaxtrachea.contact.shapes import MAX_PARTS
 from jaxtrachea.mechanics.sections.material import (
     LEAST,
     SECTION_VALUES,
@@ -207,11 +208,11 @@ TOOLS = {
 }
 
 
-class ToolSection(Section):
-    """[tool]: a convex shape about its own origin; capsule and cylinder along z."""
+class ShapeSection(Section):
+    """A convex shape about its own origin; capsule and cylinder along z."""
 
-    shape: Literal["sphere", "capsule", "box", "cylinder", "cloud", "mesh"]
-    """which convex shape"""
+    shape: Literal["sphere", "capsule", "box", "cylinder", "cloud", "mesh"] | None = None
+    """which convex shape; needed, but beside `parts`"""
     radius: PositiveLength | None = None
     """of sphere, capsule, cylinder"""
     length: PositiveLength | None = None
@@ -221,21 +222,58 @@ class ToolSection(Section):
     rounding: PositiveLength | None = None
     """of box, cylinder, cloud and mesh; it comes on top of the size, on every side"""
     file: str | None = None
-    """of a cloud: CSV of x, y, z in mm; of a mesh: a convex surface, as STL, OBJ, PLY or GLB"""
+    """of a cloud: CSV of x, y, z in mm; of a mesh: a surface, as STL, OBJ, PLY or GLB, each of
+    whose bodies is convex
+    """
     unit: str | None = None
     """of the file of a mesh: `mm` unless said"""
-    friction: float | None = Field(None, ge=0, le=10)
-    """coefficient of Coulomb friction"""
 
     @model_validator(mode="after")
-    def _fitting(self) -> "ToolSection":
+    def _fitting(self):
+        given = {name for name in ShapeSection.model_fields if name in self.model_fields_set}
+        given -= {"shape"}
+        if self.shape is None:
+            return self._without_shape(given)
         needed, allowed = TOOLS[self.shape]
-        given = self.model_fields_set - {"shape", "friction"}
         if needed - given:
             raise ValueError(f"shape {self.shape!r} needs {', '.join(sorted(needed - given))}")
         if given - needed - allowed:
             more = ", ".join(sorted(given - needed - allowed))
             raise ValueError(f"{more}: not for shape {self.shape!r}; remove it")
+        return self
+
+    def _without_shape(self, given: set[str]):
+        raise ValueError(f"shape: missing; expected one of {', '.join(TOOLS)}")
+
+
+class PartSection(ShapeSection):
+    """[[tool.parts]]: a convex part, placed in the frame of the tool."""
+
+    position: Lengths3 | None = None
+    """of its origin in the frame of the tool; none: there"""
+    rotation: Angles3 | None = None
+    """there, a rotation vector"""
+
+
+class ToolSection(ShapeSection):
+    """[tool]: one convex shape, or several parts that move together (forceps, a hook)."""
+
+    parts: list[PartSection] | None = Field(None, min_length=1, max_length=MAX_PARTS)
+    """convex parts that move together, in the place of a shape: the deepest touches"""
+    friction: float | None = Field(None, ge=0, le=10)
+    """coefficient of Coulomb friction"""
+
+    def _without_shape(self, given: set[str]):
+        if self.parts is None:
+            raise ValueError(f"shape: missing; expected one of {', '.join(TOOLS)}, or parts")
+        if given:
+            raise ValueError(f"{', '.join(sorted(given))}: of a shape, and parts have their own")
+        return self
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "ToolSection":
+        if self.shape is not None and self.parts is not None:
+            raise ValueError("parts: not together with shape; remove one")
         return self
 
 

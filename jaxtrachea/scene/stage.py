@@ -68,7 +68,8 @@ class Tool:
     """What touches the trachea.
 
     Attributes:
-        shape: about its own origin; None: presses are given at their contact points.
+        shape: about its own origin, convex or of convex parts (`contact.shapes.compound`); None:
+            presses are given at their contact points.
         friction: Coulomb's coefficient; None: the tool holds the surface.
     """
 

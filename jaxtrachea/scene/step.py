@@ -6,6 +6,7 @@ body of `lax.scan`. `Session` is the compiled loop over it.
 
 import dataclasses
 import hashlib
+import weakref
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,7 +38,7 @@ from jaxtrachea.scene.stage import Poses, Scene, check_kind, check_material, tou
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.
-STATE_VERSION = 2
+STATE_VERSION = 3
 
 
 class Origin(NamedTuple):
@@ -218,11 +219,25 @@ def origin_of(scene: Scene) -> Origin:
     return Origin(STATE_VERSION, scene.plan, digest_of(scene))
 
 
+#: Digests of scenes that are still there, by their `id`: a step need not read all numbers again.
+_DIGESTS: dict[int, str] = {}
+
+
 def digest_of(scene: Scene) -> str:
-    """Of all arrays of a scene; empty if one of them is traced."""
+    """Of all arrays of a scene, computed once; empty if one of them is traced."""
+    if (known := _DIGESTS.get(id(scene))) is not None:
+        return known
     leaves = jax.tree.leaves(scene)
     if any(isinstance(v, Tracer) for v in leaves):
         return ""
+    digest = _digest(leaves)
+    if all(isinstance(v, jax.Array) for v in leaves):  # others may be changed in place
+        _DIGESTS[id(scene)] = digest
+        weakref.finalize(scene, _DIGESTS.pop, id(scene), None).atexit = False
+    return digest
+
+
+def _digest(leaves: list) -> str:
     made = hashlib.blake2b(digest_size=16)
     for v in map(np.asarray, leaves):
         made.update(f"{v.dtype}{v.shape}".encode())

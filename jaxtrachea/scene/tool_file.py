@@ -1,4 +1,4 @@
-"""A tool from a surface file: one convex body, its corners the vertices of the shape."""
+"""A tool from a surface file: convex bodies, their corners the vertices of its parts."""
 
 from pathlib import Path
 
@@ -6,21 +6,29 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.contact import shapes
-from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.cleaning import Surface, labels
+from jaxtrachea.trachea.mesh import MeshError, edge_counts, unique_rows, volume
 from jaxtrachea.trachea.objects import combined
 from jaxtrachea.trachea.surface_file import parts_of
 from jaxtrachea.units import UnitError, unit_factor
 
 #: Share of its size that a surface may lie inside of its convex hull.
 HOLLOW = 0.01
-#: Corners of a tool at most: the cost of a contact grows with them.
+#: Share of the size of an object within which corners are one.
+WELDED = 1e-7
+#: Share of its hull that a closed body may leave empty.
+EMPTY = 0.1
+#: Corners of a convex part at most: the cost of a contact grows with them.
 MAX_CORNERS = 256
 #: Share of its size that corners may be left out by, at most.
 COARSEST = 0.01
 
 
 def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Shape, str]:
-    """A convex tool about the origin of its file, and a note on its size.
+    """A tool about the origin of its file, one convex body or several, and a note on its size.
+
+    Several bodies are the objects of the file, and what of one hangs together by its corners; they
+    may touch each other or overlap.
 
     Args:
         path: STL, OBJ, PLY, GLB and what else trimesh reads.
@@ -28,35 +36,133 @@ def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Sha
         rounding: mm, on top of the surface on every side.
 
     Raises:
-        MeshError: no surface, not convex, or with more corners than a tool may have and none that
-            can be left out.
+        MeshError: no surface, a body that is not convex or inside out, more bodies than a tool may
+            have, or one with more corners than it may have and none that can be left out.
     """
     try:
         scale = unit_factor(unit or "mm", "length")
     except UnitError as error:
         raise MeshError(str(error), key="unit") from None
-    surface = combined(list(parts_of(path).values()))
-    corners = surface.vertices[surface.faces] * float(scale)
-    points = np.unique(corners.reshape(-1, 3), axis=0)
-    size = float(np.ptp(points, axis=0).max())
-    # Two bodies apart have their corners on the hull, but not the middle of their inner faces.
-    inside = np.concatenate([points, corners.mean(axis=1)])
-    hollow = max(-float(_outside(inside, _planes(points)).min()), 0.0)
-    if hollow > HOLLOW * size:
-        raise MeshError(
-            f"it is not convex: its surface lies {hollow:.3g} mm and more inside of its hull",
-            cure="cut it into convex parts, and take the one that touches the trachea",
-        )
-    kept, left_out = _corners(points, size)
-    sizes = " x ".join(f"{v:.3g}" for v in np.ptp(points, axis=0))
-    note = f"tool: {sizes} mm, {len(kept)} corners"
+    objects = {
+        name: _welded(Surface(part.vertices * float(scale), part.faces))
+        for name, part in parts_of(path).items()
+    }
+    whole = _welded(combined(list(objects.values())))
+    pieces = _pieces(whole)
+    if len(pieces) == 1 or not all(map(_closed, pieces)):
+        pieces = [whole] if _unlike_hull(whole) is None else []
+    found = {"it": whole}
+    if len(pieces) != 1:
+        found = {
+            name if len(pieces) == 1 else f"{name}, body {i}": body
+            for name, part in objects.items()
+            for pieces in [_pieces(part)]
+            for i, body in enumerate(pieces)
+        }
+        _check_bodies(found if len(found) > 1 else {"it": whole})
+    kept, left_out = [], 0.0
+    for name, body in found.items():
+        corners, out = _corners(body, name)
+        kept.append(shapes.cloud(corners, rounding, float))
+        left_out = max(left_out, out)
+    sizes = " x ".join(f"{v:.3g}" for v in np.ptp(_points(whole), axis=0))
+    of = f" {len(kept)} convex parts," if len(kept) > 1 else ""
+    count = sum(part.vertices.shape[1] for part in kept)
+    note = f"tool: {sizes} mm,{of} {count} corners"
     if left_out > 0:
         note += f"; those left out stand out of it by up to {left_out:.2g} mm"
-    return shapes.cloud(kept, rounding, float), note
+    return kept[0] if len(kept) == 1 else shapes.compound(kept), note
+
+
+def _welded(surface: Surface) -> Surface:
+    """Corners at one place are one vertex; collapsed triangles are left out."""
+    vertices, size = surface.vertices, float(np.ptp(surface.vertices, axis=0).max())
+    first, same = unique_rows(np.round((vertices - vertices.min(axis=0)) / (WELDED * size or 1)))
+    faces = same[surface.faces]
+    return Surface(vertices[first], faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
+
+
+def _pieces(surface: Surface) -> list[Surface]:
+    """What hangs together by its corners."""
+    vertices, faces = surface
+    piece = labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(vertices))[faces[:, 0]]
+    found = []
+    for label in np.unique(piece):
+        used, own = np.unique(faces[piece == label], return_inverse=True)
+        found.append(Surface(vertices[used], own.reshape(-1, 3)))
+    return found
+
+
+def _closed(body: Surface) -> bool:
+    """Whether a volume is known: two triangles at every edge, in opposite directions."""
+    directed = body.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    once = len(unique_rows(directed)[0]) == len(directed)
+    return once and bool((edge_counts(body.faces)[1] == 2).all())
+
+
+def _check_bodies(found: dict[str, Surface]) -> None:
+    """Refuse bodies that are no convex parts of a tool.
+
+    Raises:
+        MeshError: too many, one that is not convex, or one inside out beside others that are not.
+    """
+    if len(found) > shapes.MAX_PARTS:
+        raise MeshError(
+            f"it has {len(found)} bodies; expected at most {shapes.MAX_PARTS} convex parts",
+            cure="leave out those that do not touch the trachea, or join them in fewer",
+        )
+    outward = {name: volume(*body) > 0 for name, body in found.items()}
+    for name, body in found.items():
+        if how := _unlike_hull(body):
+            raise MeshError(
+                f"{name} is not convex: {how}",
+                cure="cut it into convex parts, each a body by itself or an object of the file "
+                "(the Python packages coacd and vhacdx do; trimesh's convex_decomposition calls "
+                "the latter)",
+            )
+        if not outward[name] and any(outward.values()):
+            raise MeshError(
+                f"{name} is inside out, other bodies are not: its triangles face inwards",
+                cure="turn them, or remove it if it is the hole of another",
+            )
+
+
+def _unlike_hull(body: Surface) -> str | None:
+    """How a surface differs from its convex hull; None: it is that."""
+    hollow = _hollow(body)
+    if hollow > HOLLOW * float(np.ptp(body.vertices, axis=0).max()):
+        return f"its surface lies {hollow:.3g} mm and more inside of its hull"
+    if not _closed(body):
+        return None
+    # A long thin fork: all of its surface is near its hull.
+    own, hull = abs(volume(*body)), _hull(body.vertices).volume
+    if own < (1 - EMPTY) * hull:
+        return f"its volume is {own:.3g} mm^3, that of its hull {hull:.3g} mm^3"
+    return None
+
+
+def _points(body: Surface) -> Float[np.ndarray, "n 3"]:
+    """Different corners of the triangles."""
+    return np.unique(body.vertices[body.faces].reshape(-1, 3), axis=0)
+
+
+def _hollow(body: Surface) -> float:
+    """How far the surface lies inside of its hull, mm: at its corners or amid its triangles.
+
+    Two bodies apart have their corners on the hull, but not the middle of their inner faces.
+    """
+    corners, points = body.vertices[body.faces], _points(body)
+    inside = np.concatenate([points, corners.mean(axis=1)])
+    return max(-float(_outside(inside, _planes(points)).min()), 0.0)
 
 
 def _planes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "faces 4"]:
-    """Planes of the convex hull, outward normals first.
+    """Planes of the convex hull, outward normals first."""
+    return _hull(points).equations
+
+
+def _hull(points: Float[np.ndarray, "n 3"]):
+    """The convex hull.
 
     Raises:
         MeshError: flat, or a line.
@@ -64,7 +170,7 @@ def _planes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "faces 4"]:
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        return ConvexHull(points).equations
+        return ConvexHull(points)
     except (QhullError, ValueError):
         raise MeshError(
             "it is flat; expected a body", cure="give it a thickness, or take shape = 'cloud'"
@@ -79,16 +185,17 @@ def _outside(points: Float[np.ndarray, "n 3"], planes: Float[np.ndarray, "f 4"])
     ])  # fmt: skip
 
 
-def _corners(points: Float[np.ndarray, "n 3"], size: float) -> tuple[np.ndarray, float]:
-    """Corners of the hull, as many as a tool may have, and how far the others stand out, mm."""
+def _corners(body: Surface, name: str) -> tuple[np.ndarray, float]:
+    """Corners of the hull, as many as a part may have, and how far the others stand out, mm."""
+    points = _points(body)
     kept = np.asarray(shapes.hull(points, dtype=float).vertices).T
     if len(kept) <= MAX_CORNERS:
         return kept, 0.0
     few = _foremost(kept, MAX_CORNERS)
     left_out = max(float(_outside(kept, _planes(few)).max()), 0.0)
-    if left_out > COARSEST * size:
+    if left_out > COARSEST * float(np.ptp(points, axis=0).max()):
         raise MeshError(
-            f"it has {len(kept)} corners; of {MAX_CORNERS} some stand out by {left_out:.2g} mm",
+            f"{name} has {len(kept)} corners; of {MAX_CORNERS} some stand out by {left_out:.2g} mm",
             cure="simplify the surface, or replace round edges by rounding = '1 mm'",
         )
     return few, left_out

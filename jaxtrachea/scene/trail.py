@@ -102,6 +102,10 @@ def touching(
 
 def _distance(tool: Shape, point):
     """Signed distance of a point in the tool's frame, mm, and the outward normal there."""
+    if tool.radius.ndim == 1:
+        away, normal = jax.vmap(_distance, (0, None))(tool, point)
+        nearest = jnp.argmin(away)
+        return away[nearest], normal[nearest]
     if tool.vertices.shape[1] == 1:
         off = point - tool.vertices[:, 0]
         square = jnp.sum(off * off)

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtrachea.contact.patches import Patches, straight_patches
 from jaxtrachea.contact.search import FINE, STANDARD, Settings
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.contact.walls import TubeSurface, patches_of
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.sizes import OUTER, RADIUS
@@ -16,6 +16,8 @@ from jaxtrachea.trachea.mesh import Mesh
 
 #: Patches of the tube searched for a contact with a tool shorter than one of them.
 MIN_STATIONS = 2
+#: Parts of a tool that are searched, at most: as many may touch within the smoothing of a contact.
+TOUCHING = 4
 #: Length of a tool over the radius of the tube from which on a contact takes more steps.
 LONG = 8
 #: Patches of a mesh: their rounding, and corners of each (docs/simulate.md says what that loses).
@@ -78,8 +80,12 @@ def patches_of_wall(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
 
 
 def near_patches(tool: Shape, geometry: Geometry, count: int) -> int:
-    """As many patches as the tool can lie along, and one more."""
-    return min(MIN_STATIONS + int(_longest(tool) * count / float(geometry.length)), count)
+    """As many patches as the tool can lie along, and one more; of all parts that touch at once."""
+    along = sorted(
+        min(MIN_STATIONS + int(_longest(part) * count / float(geometry.length)), count)
+        for part in parts_of(tool)
+    )
+    return sum(along[-TOUCHING:])
 
 
 def contact_settings(tool: Shape, geometry: Geometry) -> Settings:
@@ -88,10 +94,10 @@ def contact_settings(tool: Shape, geometry: Geometry) -> Settings:
     Of 120 shafts of 300 and 980 mm on a round wall 44 were not converged after 10 steps, none after
     16.
     """
-    long = _longest(tool) > LONG * float(geometry.radius)
+    long = max(map(_longest, parts_of(tool))) > LONG * float(geometry.radius)
     return dataclasses.replace(STANDARD, warm_steps=FINE.warm_steps) if long else STANDARD
 
 
-def _longest(tool: Shape) -> float:
-    """Length of a tool along one of its axes, mm."""
-    return float(np.ptp(np.asarray(tool.vertices), axis=1).max()) + 2 * float(tool.radius)
+def _longest(part: Shape) -> float:
+    """Length of a convex body along one of its axes, mm."""
+    return float(np.ptp(np.asarray(part.vertices), axis=1).max()) + 2 * float(part.radius)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.solids import rings_on
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.status import PressStatus
@@ -38,9 +38,12 @@ def frame_of(tool: Shape | None, pose: np.ndarray, result: Any, seconds: float) 
 
 def foremost(tool: Shape, rotation: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """The point of a turned tool that lies farthest along a unit vector, from its origin, mm."""
-    corners = (rotation @ np.asarray(tool.vertices, float)).T
-    along = corners @ direction
-    return corners[along > along.max() - 1e-3].mean(axis=0) + float(tool.radius) * direction
+    tips = np.concatenate([
+        (rotation @ np.asarray(part.vertices, float)).T + float(part.radius) * direction
+        for part in parts_of(tool)
+    ])  # fmt: skip
+    along = tips @ direction
+    return tips[along > along.max() - 1e-3].mean(axis=0)
 
 
 def tube_arrays(
@@ -81,6 +84,14 @@ def tube_of(scene: Scene) -> tuple[Any, Any, np.ndarray, np.ndarray]:
 
 def tool_surface(tool: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of a tool with its rounding: corners, mm, and three of them for each side."""
+    corners, sides = zip(*map(_surface, parts_of(tool)), strict=True)
+    shift = np.cumsum([0, *map(len, corners[:-1])])
+    moved = [of + at for of, at in zip(sides, shift, strict=True)]
+    return np.concatenate(corners), np.concatenate(moved)
+
+
+def _surface(tool: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """`tool_surface` of one convex body."""
     from scipy.spatial import ConvexHull, QhullError
 
     cores, radius = np.asarray(tool.vertices, float).T, float(tool.radius)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.build import Staged, stage
 from jaxtrachea.scene.paths import path_of
 from jaxtrachea.scene.session import Session
@@ -147,4 +147,7 @@ def above(scene: Scene, s: float, phi: float, gap: float) -> np.ndarray:
 
 def reach(tool: Shape, direction: np.ndarray) -> float:
     """How far a tool goes from its origin in this direction, mm."""
-    return float((direction @ np.asarray(tool.vertices)).max() + tool.radius)
+    return max(
+        float((direction @ np.asarray(part.vertices)).max() + part.radius)
+        for part in parts_of(tool)
+    )

@@ -1,5 +1,7 @@
 """A tool from a surface file: its corners, its unit, and bodies that are none."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,7 +9,7 @@ import trimesh
 from jaxtrachea.config import SpecError
 from jaxtrachea.contact.shapes import box
 from jaxtrachea.scene.build import stage
-from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.scene.spec import SceneSpec, load_scene_spec
 from jaxtrachea.scene.tool_file import MAX_CORNERS, read_tool
 from jaxtrachea.trachea.mesh import MeshError
 
@@ -42,23 +44,71 @@ def test_a_round_body_keeps_the_corners_that_count(tmp_path):
     assert "corners; those left out stand out of it by up to 0.08" in note
 
 
-def forceps():
-    """Two jaws: all corners are on the hull, the gap between them is not."""
-    jaws = [trimesh.creation.box((2, 2, 10)) for _ in range(2)]
-    for jaw, x in zip(jaws, (3, -3), strict=True):
+def jaws(*places, size=(2, 2, 10)):
+    """Boxes with their middles on the x-axis."""
+    made = [trimesh.creation.box(size) for _ in places]
+    for jaw, x in zip(made, places, strict=True):
         jaw.apply_translation((x, 0, 0))
-    return trimesh.util.concatenate(jaws)
+    return made
+
+
+def joined(*solids):
+    return trimesh.util.concatenate(list(solids))
+
+
+def fork():
+    """Two thin tines as long as a hand and what joins them, in one body."""
+    outline = [[0, 0], [120, 0], [120, 1], [1, 1], [1, 11], [120, 11], [120, 12], [0, 12]]
+    cap = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 7], [4, 5, 7], [5, 6, 7]]
+    return trimesh.creation.extrude_triangulation(outline, cap, 1.0)
+
+
+def inside_out():
+    """A box with a box-shaped hole."""
+    hole = trimesh.creation.box((1, 1, 1))
+    hole.invert()
+    return joined(trimesh.creation.box((4, 4, 4)), hole)
+
+
+def test_bodies_apart_are_parts(tmp_path):
+    """All corners are on the hull of both jaws, the gap between them is not."""
+    joined(*jaws(3, -3)).export(tmp_path / "forceps.stl")
+    shape, note = read_tool(tmp_path / "forceps.stl", None, 0.25)
+    assert note == "tool: 8 x 2 x 10 mm, 2 convex parts, 16 corners"
+    assert shape.vertices.shape == (2, 3, 8)
+    np.testing.assert_array_equal(shape.radius, 0.25)
+    middles = np.asarray(shape.vertices).mean(axis=2)
+    np.testing.assert_allclose(middles[np.argsort(middles[:, 0])], [[-3, 0, 0], [3, 0, 0]])
+
+
+def test_objects_that_touch_are_parts(tmp_path):
+    """An L of two bricks by its objects; the same as one body is refused."""
+    foot, (leg,) = trimesh.creation.box((6, 2, 2)), jaws(2, size=(2, 6, 2))
+    leg.apply_translation((0, 4, 0))
+    trimesh.Scene({"foot": foot, "leg": leg}).export(tmp_path / "hook.glb")
+    shape, note = read_tool(tmp_path / "hook.glb", None, 0.0)
+    assert "2 convex parts" in note
+    assert shape.vertices.shape == (2, 3, 8)
+    joined(foot, leg).export(tmp_path / "hook.stl")
+    with pytest.raises(MeshError, match="not convex: .* an object of the file .*vhacdx"):
+        read_tool(tmp_path / "hook.stl", None, 0.0)
 
 
 @pytest.mark.parametrize(
     ("solid", "says"),
     [
-        (forceps, "it is not convex: its surface lies .* mm and more inside of its hull"),
-        (lambda: trimesh.creation.annulus(3, 5, 2), "cut it into convex parts"),
+        (lambda: trimesh.creation.annulus(3, 5, 2), "^it is not convex: .*cut it into convex"),
+        (fork, "^it is not convex: its volume is .* mm.3, that of its hull"),
+        (
+            lambda: joined(trimesh.creation.annulus(3, 5, 2), *jaws(9)),
+            "body 0 is not convex: its surface lies .* mm and more inside of its hull",
+        ),
+        (inside_out, "body 1 is inside out, other bodies are not"),
+        (lambda: joined(*jaws(*range(0, 132, 4))), "33 bodies; expected at most 32 convex parts"),
         (lambda: trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), "it is flat"),
     ],
-)
-def test_what_is_no_convex_body(solid, says, tmp_path):
+)  # fmt: skip
+def test_what_is_no_tool(solid, says, tmp_path):
     solid().export(tmp_path / "tool.stl")
     with pytest.raises(MeshError, match=says):
         read_tool(tmp_path / "tool.stl", None, 0.0)
@@ -93,3 +143,58 @@ def test_a_bad_key_is_named(tool, says, tmp_path):
     spec = SceneSpec.model_validate(SCENE | {"tool": {"shape": "mesh"} | tool})
     with pytest.raises(SpecError, match=says):
         stage(spec, tmp_path)
+
+
+def test_parts_stand_where_the_scene_says(tmp_path):
+    """A ball and a box from a file, turned by 90 degrees about x: its z is the tool's -y."""
+    trimesh.creation.box(BOX).export(tmp_path / "probe.stl")
+    ball = {"shape": "sphere", "radius": "2 mm", "position": ["-9 mm", "0 mm", "0 mm"]}
+    turned = {"rotation": ["90 deg", "0 deg", "0 deg"], "position": ["0 mm", "1 mm", "0 mm"]}
+    parts = [ball, {"shape": "mesh", "file": "probe.stl"} | turned]
+    staged = stage(SceneSpec.model_validate(SCENE | {"tool": {"parts": parts}}), tmp_path)
+    tool = staged.scene.tool
+    np.testing.assert_array_equal(tool.radius, [2, 0])
+    np.testing.assert_array_equal(tool.counts.sum(axis=1), [1, 8])
+    np.testing.assert_array_equal(tool.vertices[0], np.tile([[-9.0], [0], [0]], 8))
+    reach = np.asarray(tool.vertices[1])
+    np.testing.assert_allclose(reach.max(axis=1), [6, 3, 3], atol=1e-12)
+    np.testing.assert_allclose(reach.min(axis=1), [-6, -1, -3], atol=1e-12)
+    assert "tool: 12 x 6 x 4 mm, 8 corners" in staged.notes
+
+
+BALL = {"shape": "sphere", "radius": "2 mm"}
+
+
+def toml(value):
+    """A value on one line."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{k} = {toml(v)}' for k, v in value.items())} }}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml, value))}]"
+    return json.dumps(value)
+
+
+@pytest.mark.parametrize(
+    ("tool", "says"),
+    [
+        ({}, "tool: shape: missing; expected one of sphere, .*, or parts"),
+        ({"parts": []}, "tool.parts: expected at least 1 item"),
+        ({"parts": [BALL] * 33}, "tool.parts: expected at most 32 items"),
+        ({"parts": [BALL], "shape": "sphere", "radius": "1 mm"}, "parts: not together with shape"),
+        ({"parts": [BALL], "radius": "1 mm"}, "tool: radius: of a shape, and parts have their own"),
+        ({"parts": [BALL, {}]}, "tool.parts.1: shape: missing"),
+        ({"parts": [BALL | {"friction": 0.3}]}, "tool.parts.0.friction: unknown key"),
+        ({"parts": [BALL | {"position": ["1 mm"]}]}, "tool.parts.0.position: .* 3 items"),
+    ],
+)
+def test_bad_parts_are_named(tool, says, tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text("\n".join(f"{k} = {toml(v)}" for k, v in (SCENE | {"tool": tool}).items()))
+    with pytest.raises(SpecError, match=says):
+        load_scene_spec(path)
+
+
+def test_a_bad_file_of_a_part_is_named(tmp_path):
+    parts = [BALL, {"shape": "mesh", "file": "none.stl"}]
+    with pytest.raises(SpecError, match=r"^tool\.parts\.1\.file"):
+        stage(SceneSpec.model_validate(SCENE | {"tool": {"parts": parts}}), tmp_path)
