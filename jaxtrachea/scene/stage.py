@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -162,6 +163,26 @@ def check_path(path: Presses | Poses) -> None:
         shaped("path.time", path.time, (rows,), why=" (rows as the path has)")
 
 
+class Instrument(eqx.Module):
+    """One of several tools: what a `Scene` of this tool alone has of its own.
+
+    Attributes:
+        name: of the tool (static).
+        tool: see `Scene`, as all others.
+        friction: -
+        footprint: -
+        near: -
+        quality: -
+    """
+
+    name: str = eqx.field(static=True)
+    tool: Shape | None
+    friction: Float[Array, ""] | None
+    footprint: Float[Array, ""]
+    near: int = eqx.field(static=True)
+    quality: Settings = eqx.field(static=True)
+
+
 class Scene(eqx.Module):
     """Everything of a scene but its material and its path.
 
@@ -177,6 +198,8 @@ class Scene(eqx.Module):
         footprint: distance between the circles of the dent's centres, mm.
         runs: order of the mesh's vertices, for a dent of this footprint; or None.
         points: the vertices on the wall of deforming cross-sections, in the place of `binding`.
+        instruments: tools of a scene whose path is a mapping, in its order; tool and friction are
+            None then, and the footprint is the largest. Empty: one tool, or none.
         plan: the program (static).
         quality: accuracy and work of the search for a contact (static).
     """
@@ -194,6 +217,85 @@ class Scene(eqx.Module):
     quality: Settings = eqx.field(static=True, default=STANDARD)
     runs: local.Runs | None = None
     points: Points | None = None
+    instruments: tuple[Instrument, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the instruments."""
+        return [instrument.name for instrument in self.instruments]
+
+
+def scene_of(scene: Scene, instrument: Instrument) -> Scene:
+    """The scene as if this instrument were its only tool."""
+    own = {f.name: getattr(instrument, f.name) for f in dataclasses.fields(Instrument)}
+    del own["name"]
+    return dataclasses.replace(scene, instruments=(), **own)
+
+
+def paths_in_order(
+    names: list[str], paths: Mapping[str, Presses | Poses]
+) -> tuple[Presses | Poses, ...]:
+    """Checked paths in the order of these tools; shorter ones rest at their last row.
+
+    Raises:
+        ValueError: other names than those; as `check_path`; presses beside motions; times for some
+            paths alone, or clocks that do not agree.
+    """
+    if set(paths) != set(names):
+        raise ValueError(f"path has the tools {_listed(paths)}; expected {_listed(names)}")
+    found = [paths[name] for name in names]
+    for name, path in zip(names, found, strict=True):
+        try:
+            check_path(path)
+        except ValueError as error:
+            raise ValueError(f"path of tool {name!r}: {error}") from None
+    if len({type(path) for path in found}) > 1:
+        kinds = ", ".join(f"{n!r} {type(p).__name__}" for n, p in zip(names, found, strict=True))
+        raise ValueError(f"path mixes kinds ({kinds}); expected Poses for all tools, or Presses")
+    _check_clocks(names, found)
+    rows = max(map(rows_of, found))
+    return tuple(_rested(path, rows) for path in found)
+
+
+def _listed(names) -> str:
+    return ", ".join(map(repr, names)) or "none"
+
+
+def rows_of(path: Presses | Poses) -> int:
+    """How many rows a path has."""
+    return len(path.s if isinstance(path, Presses) else path.translation)
+
+
+def _rested(path: Presses | Poses, rows: int) -> Presses | Poses:
+    """The path, resting at its last row up to so many."""
+    more = rows - rows_of(path)
+    if not more:
+        return path
+    return jax.tree.map(lambda v: jnp.concatenate([v, jnp.repeat(v[-1:], more, axis=0)]), path)
+
+
+def _check_clocks(names: list[str], paths: list[Presses | Poses]) -> None:
+    """Refuse times that are not those of one clock (traced ones are not looked at).
+
+    Raises:
+        ValueError: naming both tools and the row.
+    """
+    timed = [path.time is not None for path in paths]
+    if any(timed) and not all(timed):
+        without, other = names[timed.index(False)], names[timed.index(True)]
+        raise ValueError(f"path of tool {without!r} has no time; expected one, as {other!r} has")
+    first = paths[0].time
+    for name, path in zip(names[1:], paths[1:], strict=True):
+        if first is None or path.time is None or any(isinstance(v, Tracer) for v in (first, path.time)):
+            continue
+        a, b = np.asarray(first), np.asarray(path.time)
+        both = min(len(a), len(b))
+        if len(a) != len(b) or (a != b).any():
+            row = int(np.argmax(a[:both] != b[:both])) + 1 if (a[:both] != b[:both]).any() else both
+            raise ValueError(
+                f"path of tool {name!r} has another time than that of {names[0]!r}, from row {row} "
+                f"on ({len(b)} rows, {len(a)} rows); expected the same times, row by row"
+            )
 
 
 def touch_tube(scene: Scene, path: Poses) -> Touch:

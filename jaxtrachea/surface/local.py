@@ -186,10 +186,10 @@ def fit(
     n = centres.shape[0]
 
     def solve(centres, targets, reach):
-        matrix = _kernel(centres, centres, reach)
+        matrix = kernel(centres, centres, reach)
         ridge = 16 * n * epsilon(matrix.dtype)
         if softness is not None:
-            ridge = ridge + softness
+            ridge = ridge + softness[:, None]
         matrix = matrix + ridge * jnp.eye(n, dtype=matrix.dtype)
         targets = targets.astype(jnp.result_type(targets, matrix))
         factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
@@ -223,7 +223,7 @@ _dot = functools.partial(jnp.dot, precision="highest")
 @jax.custom_jvp
 def _spread(weights, centres, points, reach):
     """Sum of the kernels of all centres at every point; shape (points,)."""
-    return _dot(weights, _kernel(centres, points, reach))
+    return _dot(weights, kernel(centres, points, reach))
 
 
 @functools.partial(_spread.defjvp, symbolic_zeros=True)
@@ -326,8 +326,8 @@ def add_correction(
     return u + _together(dent, [spread(jnp.where(whole, v, jnp.nan)) for v in here])
 
 
-def _kernel(points, centres, reach):
-    """The kernel psi between points and centres; shape (points, centres)."""
+def kernel(points, centres, reach):
+    """psi between points and centres: 1 at a centre, 0 from `reach` on; (points, centres)."""
     return _psi(_distance(points, centres, reach))
 
 
