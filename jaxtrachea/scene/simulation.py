@@ -19,7 +19,7 @@ from jaxtrachea.mechanics.press_history import History, Samples, at_rest
 from jaxtrachea.mechanics.press_in_time import validated
 from jaxtrachea.mechanics.samples import in_order
 from jaxtrachea.relaxation.filter import Relaxation
-from jaxtrachea.scene.approach import Approach, approach
+from jaxtrachea.scene.approach import Approach, approach, approach_together
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
 from jaxtrachea.scene.programs import Moved, move
@@ -173,11 +173,9 @@ def _of_tools(
     if scene.plan.tools == "one":
         alone = _simulate(scene_of(scene, scene.instruments[0]), material, paths[0])
         return with_axis(alone)
-    views = [scene_of(scene, instrument) for instrument in scene.instruments]
-    made = [
-        approach(view, path) if isinstance(path, Poses) else None
-        for view, path in zip(views, paths, strict=True)
-    ]
+    poses, made = [path for path in paths if isinstance(path, Poses)], [None] * len(paths)
+    if poses:
+        made = approach_together(scene, poses)
     found, moved = press_together(scene, material, paths, made)
     vertices = deform_together(scene, moved)
     none = dict.fromkeys(Simulation._fields)

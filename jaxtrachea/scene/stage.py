@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -309,6 +309,25 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
     return _touch_rows(scene.tool, scene.tube, path, scene.quality, scene.near)
+
+
+def touch_together(scene: Scene, paths: Sequence[Poses]) -> list[Touch]:
+    """As `touch_tube`, of every instrument; those that are alike in kind share one program."""
+    assert scene.tube is not None
+    found: dict[int, Touch] = {}
+    alike: dict[Any, list[int]] = {}
+    for i, tool in enumerate(scene.instruments):
+        alike.setdefault((jax.tree.map(jnp.shape, tool.tool), tool.near, tool.quality), []).append(i)
+    for (_, near, quality), which in alike.items():
+        chosen = [(scene.instruments[i].tool, paths[i].rotation, paths[i].translation) for i in which]
+        tools, R, T = jax.tree.map(lambda *v: jnp.stack(v), *chosen)
+
+        def one(tool, R, T, near=near, quality=quality):
+            return _touch_rows(tool, scene.tube, Poses(R, T), quality, near)
+
+        seen = jax.vmap(one)(tools, R, T)
+        found |= {i: jax.tree.map(lambda v: v[k], seen) for k, i in enumerate(which)}
+    return [found[i] for i in range(len(paths))]
 
 
 @partial(jax.jit, static_argnames=("quality", "near"), inline=True)
