@@ -136,6 +136,7 @@ TYPES = {
     "tuple[Duration, ...]": ("durations", ""),
     "dict[str, ParameterSection]": ("table of tables", ""),
     "list[PathSection]": ("tables", ""),
+    "Tools": ("table, or tables", ""),
 }
 
 

@@ -182,6 +182,12 @@ def _of_tools(
     return Simulation(**none | found | {"vertices": vertices, "time": paths[0].time})
 
 
+def of_tool(result: Simulation, tool: int) -> Simulation:
+    """Of a result for several tools that of one, without their axis."""
+    fields = {name: getattr(result, name) for name in OF_TOOLS}
+    return result._replace(**{n: v[:, tool] for n, v in fields.items() if v is not None})
+
+
 def with_axis(alone: Simulation) -> Simulation:
     """The result for one tool, with an axis of tools behind that of rows."""
     fields = {name: getattr(alone, name) for name in OF_TOOLS}
