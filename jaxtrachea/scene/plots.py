@@ -80,13 +80,13 @@ def draw_tools(names: list[str], out: Simulation) -> Figure:
         for j, name in enumerate(names):
             axis.plot(row, along[:, j], ls=styles[j % 4], lw=1.1, label=name, color=f"C{j % 10}")
             if label.startswith("normal"):
-                _draw_status(axis, row, along[:, j], status[:, j], name)
+                _draw_status(axis, row, along[:, j], status[:, j], counted=False)
         axis.set(xlabel="row", ylabel=label)
         axis.margins(y=0.08)
         low, high = axis.get_ylim()
         axis.set_ylim(low, high + 0.4 * (high - low))  # room for the legend
         handles = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
-        axis.legend(handles.values(), handles, frameon=False, fontsize=7, loc="upper left", ncols=2)
+        axis.legend(handles.values(), handles, frameon=False, fontsize=7, loc="upper left")
         axis.grid(alpha=0.25)
     return figure
 
@@ -124,9 +124,9 @@ def _draw_parts(axis: Any, way: np.ndarray, parts: dict[str, np.ndarray], colour
 
 
 def _draw_status(
-    axis: Any, way: np.ndarray, force: np.ndarray, status: np.ndarray, tool: str = ""
+    axis: Any, way: np.ndarray, force: np.ndarray, status: np.ndarray, counted: bool = True
 ) -> None:
-    """A mark for every row by its status, named in the legend; of one of several tools by name."""
+    """A mark for every row by its status, named in the legend, with the number of rows."""
     for code in np.unique(status):
         which = PressStatus(int(code))
         solved = status == code
@@ -134,14 +134,10 @@ def _draw_status(
         height = force[solved] if which.solved else np.zeros(solved.sum())
         axis.scatter(
             way[solved], np.nan_to_num(height), marker=mark, s=16, linewidths=0.9,
-            zorder=3, label=f"{_of(tool)}{which.name.lower().replace('_', ' ')} "
-            f"({solved.sum()} rows)",
+            zorder=3, label=which.name.lower().replace("_", " ")
+            + (f" ({solved.sum()} rows)" if counted else ""),
             **({"color": edge} if mark == "x" else {"facecolors": face, "edgecolors": edge}),
         )  # fmt: skip
-
-
-def _of(tool: str) -> str:
-    return f"{tool}: " if tool else ""
 
 
 def draw_map(s, phi, values: np.ndarray, label: str) -> Figure:
