@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -82,6 +83,7 @@ def draw_tools(names: list[str], out: Simulation) -> Figure:
             if label.startswith("normal"):
                 _draw_status(axis, row, along[:, j], status[:, j], counted=False)
         axis.set(xlabel="row", ylabel=label)
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.margins(y=0.08)
         low, high = axis.get_ylim()
         axis.set_ylim(low, high + 0.4 * (high - low))  # room for the legend

@@ -178,8 +178,12 @@ def _of_tools(
         made = approach_together(scene, poses)
     found, moved = press_together(scene, material, paths, made)
     vertices = deform_together(scene, moved)
-    none = dict.fromkeys(Simulation._fields)
-    return Simulation(**none | found | {"vertices": vertices, "time": paths[0].time})
+    return as_simulation(found)._replace(vertices=vertices, time=paths[0].time)
+
+
+def as_simulation(found: dict[str, Any]) -> Simulation:
+    """The result of `press_together`; None what is not in it."""
+    return Simulation(**dict.fromkeys(Simulation._fields) | found)
 
 
 def of_tool(result: Simulation, tool: int) -> Simulation:

@@ -68,6 +68,7 @@ def press_together(
     material: Material,
     paths: Sequence[Poses | Presses],
     made: Sequence[Approach | None],
+    present: Bool[Array, "rows m"] | None = None,
 ) -> tuple[dict[str, Any], Together]:
     """Fields of a `Simulation` but the surface, and what that follows from.
 
@@ -78,6 +79,7 @@ def press_together(
         material: -
         paths: of the tools, all of as many rows.
         made: the way of each; None: its path is of presses.
+        present: tools that are there; None: all, and those that are glued from first touch on.
     """
     each = views(scene)
     safe, bad = without_negative_values(scene, material)
@@ -93,7 +95,9 @@ def press_together(
     D = jnp.where(hidden[:, None], 0, D)
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
     unit = _influence(scene, safe, s)
-    depth, force, solved = _forces(scene, safe, s, unit, D, _present(made, D))
+    if present is None and scene.plan.options.contact == "bonded":
+        present = _touched(made, D)
+    depth, force, solved = _forces(scene, safe, s, unit, D, present)
     skeleton, joints, loads, slopes, turns = (
         product_of_rows(force, v)
         for v in (unit.compliance, unit.joints, unit.reactions, unit.slopes, unit.turns)
@@ -155,7 +159,7 @@ def _half(scene: Scene) -> float:
     return scene.plan.options.half_width
 
 
-def _present(made: Sequence[Approach | None], D) -> Bool[Array, "rows m"]:
+def _touched(made: Sequence[Approach | None], D) -> Bool[Array, "rows m"]:
     """Rows since the first touch of each tool: before it one that is glued holds nothing."""
     row = jnp.arange(D.shape[0])
     return jnp.stack([
@@ -172,7 +176,7 @@ def _forces(scene: Scene, material: Material, s, unit: Influence, D, present):
     if scene.plan.tools == "coupled":
         width = None
         if options.contact == "unilateral":
-            width, present = jnp.asarray(options.onset_width, D.dtype), None
+            width = jnp.asarray(options.onset_width, D.dtype)
 
         def row(D, present):
             return solve(D, unit.compliance, law, width=width, present=present)
@@ -180,7 +184,7 @@ def _forces(scene: Scene, material: Material, s, unit: Influence, D, present):
         found = jax.vmap(row, (0, None if present is None else 0))(D, present)
         depth = found.depth if width is None else jnp.maximum(found.depth, 0)
         return depth, found.force, found.status
-    D = D if options.contact == "unilateral" else jnp.where(present, D, 0)
+    D = D if present is None else jnp.where(present, D, 0)
 
     def alone(D, compliance, law):
         return respond(D, compliance, Contact(law, jnp.zeros_like(compliance)), options)
