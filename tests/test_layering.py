@@ -50,7 +50,7 @@ WITHIN = {
         {"wall", "effects"},
         {"plan", "spec"},
         {"rules", "stage", "tool_file"},
-        {"landing", "lumen", "ranges", "trail", "paths"},
+        {"landing", "lumen", "ranges", "trail", "paths", "instruments"},
         {"approach"},
         {"facts", "refusals", "deform", "programs", "overlap"},
         {"configurational", "dents"},

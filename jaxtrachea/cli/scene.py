@@ -282,7 +282,7 @@ def _default(scene: Path, ending: str = "") -> Path:
 
 
 def _rows(staged) -> int:
-    from jaxtrachea.scene.stage import rows_of
+    from jaxtrachea.scene.instruments import rows_of
 
     paths = staged.path.values() if staged.scene.instruments else [staged.path]
     return max(map(rows_of, paths))
@@ -368,7 +368,7 @@ def _print_rows(out, names) -> None:
     count = len(out.s)
     pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
 
-    def row(i: int, out, name: str = "") -> dict[str, object]:
+    def row(i: int, out, name: str) -> dict[str, object]:
         def rounded(x) -> float:
             return float(np.round(x, 9) + 0.0)
 
@@ -398,6 +398,6 @@ def _print_rows(out, names) -> None:
     title = f"{count} rows"
     if len(pick) < count:
         title = f"{len(pick)} of {count} rows; all are in simulation.h5"
-    each = [(of_tool(out, j), name) for j, name in enumerate(names)] if names else [(out,)]
+    each = [(of_tool(out, j), name) for j, name in enumerate(names)] or [(out, "")]
     lines = (row(i, *one) for i in pick.tolist() for one in each)
     Console().print(table(Table(lines, columns, title=title)))

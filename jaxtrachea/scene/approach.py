@@ -11,16 +11,10 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.instruments import scene_of, touch_together
 from jaxtrachea.scene.landing import Landing, landing
 from jaxtrachea.scene.lumen import in_lumen
-from jaxtrachea.scene.stage import (
-    Poses,
-    Presses,
-    Scene,
-    scene_of,
-    touch_together,
-    touch_tube,
-)
+from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
 
 
 class Approach(NamedTuple):

@@ -17,6 +17,7 @@ from jaxtrachea.mechanics.sections.wall import Points, gather_points
 from jaxtrachea.scene.declare import PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of, facts_together
+from jaxtrachea.scene.instruments import paths_in_order, rows_of, scene_of
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import OUTER, RADIUS, check_sizes, check_width
 from jaxtrachea.scene.stage import (
@@ -27,9 +28,6 @@ from jaxtrachea.scene.stage import (
     Tool,
     check_material,
     check_path,
-    paths_in_order,
-    rows_of,
-    scene_of,
 )
 from jaxtrachea.scene.wall import checked_walls, contact_settings, near_patches, round_wall
 from jaxtrachea.surface import local, regions

@@ -328,8 +328,8 @@ def _shape(
         return shapes.box(np.asarray(section.size) / 2, rounding), ()
     path = named_file(folder, section.file or "", f"{key}.file", files)
     if section.shape == "cloud":
-        points = np.stack(list(read_table(path, f"{key}.file", ("x", "y", "z"), {}).values()), axis=1)
-        return shapes.hull(points, rounding), ()
+        columns = read_table(path, f"{key}.file", ("x", "y", "z"), {})
+        return shapes.hull(np.stack(list(columns.values()), axis=1), rounding), ()
     try:
         shape, note = read_tool(path, section.unit, rounding)
     except MeshError as error:

@@ -70,9 +70,7 @@ def lay_out(
     radii = [v.radius if p[1] is None else p[1][0] for v, p in zip(each, parts, strict=True)]
     m, count = len(each), each[0].plan.dent
     spacing = [v.footprint for v in each]
-    laid = [
-        local.centres(s[j], phi[j], radii[j], spacing[j], count) for j in range(m)
-    ]
+    laid = [local.centres(s[j], phi[j], radii[j], spacing[j], count) for j in range(m)]
     centres = where = jnp.concatenate(laid)
     if each[0].plan.curved and each[0].tube is not None:
         where = lay(each[0].tube.line, centres)

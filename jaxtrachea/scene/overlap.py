@@ -33,7 +33,8 @@ def overlapping(tools: Sequence[Shape], paths: Sequence[Poses]) -> Bool[Array, "
     R, T = (jnp.stack(v) for v in zip(*((p.rotation, p.translation) for p in paths), strict=True))
 
     def pair(i, j):
-        a, b = (jax.tree.map(lambda v: v[k], shapes) for k in (i, j))
+        a = jax.tree.map(lambda v: v[i], shapes)
+        b = jax.tree.map(lambda v: v[j], shapes)
 
         def distance(*poses):
             between = relative(Pose(*poses[:2]), Pose(*poses[2:]))

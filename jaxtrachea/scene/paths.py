@@ -42,11 +42,11 @@ def path_of(
     Raises:
         SpecError: a file or a value that cannot be used, with its key.
     """
-    legs = dict(enumerate(spec.path))
+    legs, given = dict(enumerate(spec.path)), (spec, folder, files, geometry)
     if not spec.names:
-        return _path(legs, spec, folder, files, geometry)
+        return _path(legs, *given)
     return {
-        name: _path({i: v for i, v in legs.items() if v.tool == name}, spec, folder, files, geometry)
+        name: _path({i: leg for i, leg in legs.items() if leg.tool == name}, *given)
         for name in spec.names
     }
 
@@ -80,8 +80,7 @@ def _times(
         SpecError: a leg without a time beside others that have one, or with two.
     """
     timed = [
-        leg.duration is not None or t is not None
-        for leg, t in zip(legs.values(), own, strict=True)
+        leg.duration is not None or t is not None for leg, t in zip(legs.values(), own, strict=True)
     ]
     if not any(timed):
         return None

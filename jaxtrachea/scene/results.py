@@ -11,9 +11,10 @@ from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.files.table import Table
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES
+from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.simulation import OF_TOOLS, Simulation, of_tool
-from jaxtrachea.scene.stage import Poses, Presses, Scene, scene_of
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.scene.sweep import Sweep
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import VALUES
@@ -148,11 +149,12 @@ def _force_rows(out: Simulation, tool: str = "") -> list[dict]:
             parts = np.asarray(value, float).reshape(len(out.status), -1).T
             columns |= dict(zip(heads, parts, strict=True))
     columns["depth_share"] = np.asarray(out.depth_share, float)
-    named = {"tool": tool} if tool else {}
-    return [
-        {"row": i + 1, **named, **{head: float(v[i]) for head, v in columns.items()}, "status": word}
-        for i, word in enumerate(PressStatus(int(v)).name for v in np.asarray(out.status))
-    ]
+    rows = []
+    for i, status in enumerate(np.asarray(out.status)):
+        numbers = {head: float(v[i]) for head, v in columns.items()}
+        named = {"row": i + 1} | ({"tool": tool} if tool else {})
+        rows.append(named | numbers | {"status": PressStatus(int(status)).name})
+    return rows
 
 
 def write_sweep(path: Path, scene: Scene, s, phi, depth: float, out: Sweep, made: dict) -> None:

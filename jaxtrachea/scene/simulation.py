@@ -22,6 +22,7 @@ from jaxtrachea.relaxation.filter import Relaxation
 from jaxtrachea.scene.approach import Approach, approach, approach_together
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
+from jaxtrachea.scene.instruments import paths_in_order, scene_of
 from jaxtrachea.scene.programs import Moved, move
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import (
@@ -39,8 +40,6 @@ from jaxtrachea.scene.stage import (
     check_kind,
     check_material,
     check_path,
-    paths_in_order,
-    scene_of,
 )
 from jaxtrachea.scene.together import deform_together, press_together
 from jaxtrachea.status import PressStatus
@@ -91,9 +90,9 @@ class Simulation(NamedTuple):
             both in the frame of the poses; shape (rows, 3, 3). Of `step` alone, on request.
     """
 
-    s: Float[Array, "rows *tools"]
-    phi: Float[Array, "rows *tools"]
-    gap: Float[Array, "rows *tools"] | None
+    s: Float[Array, " rows *tools"]
+    phi: Float[Array, " rows *tools"]
+    gap: Float[Array, " rows *tools"] | None
     displacement: Float[Array, "rows *tools 3"]
     force: Float[Array, "rows *tools 3"]
     moment: Float[Array, "rows *tools 3"] | None
@@ -104,12 +103,12 @@ class Simulation(NamedTuple):
     end_U: Float[Array, "rows rings 3"] | None
     end_V: Float[Array, "rows rings 3"] | None
     slip: Float[Array, "rows *tools 3"] | None
-    dissipated: Float[Array, "rows *tools"] | None
+    dissipated: Float[Array, " rows *tools"] | None
     frame: Float[Array, "rows *tools 3 3"] | None
     vertices: Float[Array, "rows vertices 3"] | None
-    depth_share: Float[Array, "rows *tools"]
-    contact_share: Float[Array, "rows *tools"] | None
-    status: Int[Array, "rows *tools"]
+    depth_share: Float[Array, " rows *tools"]
+    contact_share: Float[Array, " rows *tools"] | None
+    status: Int[Array, " rows *tools"]
     time: Float[Array, " rows"] | None = None
     stiffness: Float[Array, "rows 3 3"] | None = None
 
@@ -166,24 +165,23 @@ def simulate(
 
 
 @functools.partial(jax.jit, inline=True)
-def _of_tools(
-    scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Presses]
-) -> Simulation:
+def _of_tools(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Presses]) -> Simulation:
     """`simulate`, of arguments that are checked, for the tools of a mapping."""
     if scene.plan.tools == "one":
         alone = _simulate(scene_of(scene, scene.instruments[0]), material, paths[0])
         return with_axis(alone)
-    poses, made = [path for path in paths if isinstance(path, Poses)], [None] * len(paths)
-    if poses:
-        made = approach_together(scene, poses)
-    found, moved = press_together(scene, material, paths, made)
+    made: list[Approach | None] = [None] * len(paths)
+    if poses := [path for path in paths if isinstance(path, Poses)]:
+        made = [*approach_together(scene, poses)]
+    found, moved = press_together(scene, long_run(material), paths, made)
     vertices = deform_together(scene, moved)
     return as_simulation(found)._replace(vertices=vertices, time=paths[0].time)
 
 
 def as_simulation(found: dict[str, Any]) -> Simulation:
     """The result of `press_together`; None what is not in it."""
-    return Simulation(**dict.fromkeys(Simulation._fields) | found)
+    none: dict[str, Any] = dict.fromkeys(Simulation._fields)
+    return Simulation(**none | found)
 
 
 def of_tool(result: Simulation, tool: int) -> Simulation:

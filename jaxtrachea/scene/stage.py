@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -225,79 +224,6 @@ class Scene(eqx.Module):
         return [instrument.name for instrument in self.instruments]
 
 
-def scene_of(scene: Scene, instrument: Instrument) -> Scene:
-    """The scene as if this instrument were its only tool."""
-    own = {f.name: getattr(instrument, f.name) for f in dataclasses.fields(Instrument)}
-    del own["name"]
-    return dataclasses.replace(scene, instruments=(), **own)
-
-
-def paths_in_order(
-    names: list[str], paths: Mapping[str, Presses | Poses]
-) -> tuple[Presses | Poses, ...]:
-    """Checked paths in the order of these tools; shorter ones rest at their last row.
-
-    Raises:
-        ValueError: other names than those; as `check_path`; presses beside motions; times for some
-            paths alone, or clocks that do not agree.
-    """
-    if set(paths) != set(names):
-        raise ValueError(f"path has the tools {_listed(paths)}; expected {_listed(names)}")
-    found = [paths[name] for name in names]
-    for name, path in zip(names, found, strict=True):
-        try:
-            check_path(path)
-        except ValueError as error:
-            raise ValueError(f"path of tool {name!r}: {error}") from None
-    if len({type(path) for path in found}) > 1:
-        kinds = ", ".join(f"{n!r} {type(p).__name__}" for n, p in zip(names, found, strict=True))
-        raise ValueError(f"path mixes kinds ({kinds}); expected Poses for all tools, or Presses")
-    _check_clocks(names, found)
-    rows = max(map(rows_of, found))
-    return tuple(_rested(path, rows) for path in found)
-
-
-def _listed(names) -> str:
-    return ", ".join(map(repr, names)) or "none"
-
-
-def rows_of(path: Presses | Poses) -> int:
-    """How many rows a path has."""
-    return len(path.s if isinstance(path, Presses) else path.translation)
-
-
-def _rested(path: Presses | Poses, rows: int) -> Presses | Poses:
-    """The path, resting at its last row up to so many."""
-    more = rows - rows_of(path)
-    if not more:
-        return path
-    return jax.tree.map(lambda v: jnp.concatenate([v, jnp.repeat(v[-1:], more, axis=0)]), path)
-
-
-def _check_clocks(names: list[str], paths: list[Presses | Poses]) -> None:
-    """Refuse times that are not those of one clock (traced ones are not looked at).
-
-    Raises:
-        ValueError: naming both tools and the row.
-    """
-    timed = [path.time is not None for path in paths]
-    if any(timed) and not all(timed):
-        without, other = names[timed.index(False)], names[timed.index(True)]
-        raise ValueError(f"path of tool {without!r} has no time; expected one, as {other!r} has")
-    first = paths[0].time
-    for name, path in zip(names[1:], paths[1:], strict=True):
-        if first is None or path.time is None or any(isinstance(v, Tracer) for v in (first, path.time)):
-            continue
-        a, b = np.asarray(first), np.asarray(path.time)
-        both = min(len(a), len(b))
-        if len(a) != len(b) or (a != b).any():
-            row = int(np.argmax(a[:both] != b[:both])) + 1 if (a[:both] != b[:both]).any() else both
-            raise ValueError(
-                f"path of tool {name!r} has another time than that of {names[0]!r}, from row {row} "
-                f"on ({len(b)} rows, {len(a)} rows); expected the same times, row by row"
-            )
-
-
 def touch_tube(scene: Scene, path: Poses) -> Touch:
     """Contact of the tool with the tube at rest, row by row, batched.
 
@@ -308,30 +234,11 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     """
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
-    return _touch_rows(scene.tool, scene.tube, path, scene.quality, scene.near)
-
-
-def touch_together(scene: Scene, paths: Sequence[Poses]) -> list[Touch]:
-    """As `touch_tube`, of every instrument; those that are alike in kind share one program."""
-    assert scene.tube is not None
-    found: dict[int, Touch] = {}
-    alike: dict[Any, list[int]] = {}
-    for i, tool in enumerate(scene.instruments):
-        alike.setdefault((jax.tree.map(jnp.shape, tool.tool), tool.near, tool.quality), []).append(i)
-    for (_, near, quality), which in alike.items():
-        chosen = [(scene.instruments[i].tool, paths[i].rotation, paths[i].translation) for i in which]
-        tools, R, T = jax.tree.map(lambda *v: jnp.stack(v), *chosen)
-
-        def one(tool, R, T, near=near, quality=quality):
-            return _touch_rows(tool, scene.tube, Poses(R, T), quality, near)
-
-        seen = jax.vmap(one)(tools, R, T)
-        found |= {i: jax.tree.map(lambda v: v[k], seen) for k, i in enumerate(which)}
-    return [found[i] for i in range(len(paths))]
+    return touch_rows(scene.tool, scene.tube, path, scene.quality, scene.near)
 
 
 @partial(jax.jit, static_argnames=("quality", "near"), inline=True)
-def _touch_rows(tool: Shape, tube: Patches, path: Poses, quality: Settings, near: int) -> Touch:
+def touch_rows(tool: Shape, tube: Patches, path: Poses, quality: Settings, near: int) -> Touch:
     """`touch_tube`: of other plans of a scene too it is traced once."""
 
     def one(R, T):

@@ -27,6 +27,7 @@ from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.grip import Slip, pick
 from jaxtrachea.scene.hold import hold
+from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.one_row import Row
@@ -38,7 +39,6 @@ from jaxtrachea.scene.stage import (
     Scene,
     check_kind,
     check_material,
-    scene_of,
     touch_tube,
 )
 from jaxtrachea.scene.step_together import States, move_tools
@@ -298,9 +298,7 @@ class Numbers:
         states: layout of the state.
     """
 
-    def __init__(
-        self, scene: Scene, given: Changeable, state: State | States, *, stiffness: bool
-    ):
+    def __init__(self, scene: Scene, given: Changeable, state: State | States, *, stiffness: bool):
         """Lay out what changes and the state, or others of their shapes."""
         self._scene, self._stiffness = scene, stiffness
         self.given, self.states = Packing(given, weak=scene.footprint.dtype), Packing(state)

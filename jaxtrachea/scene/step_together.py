@@ -13,9 +13,10 @@ from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.scene.anchor import Instant
 from jaxtrachea.scene.grip import pick
 from jaxtrachea.scene.hold import hold
+from jaxtrachea.scene.instruments import scene_of, touch_together
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.simulation import Simulation, as_simulation
-from jaxtrachea.scene.stage import Poses, Scene, scene_of, touch_together
+from jaxtrachea.scene.stage import Poses, Scene
 from jaxtrachea.scene.together import Together, press_together
 from jaxtrachea.status import PressStatus
 
@@ -33,7 +34,7 @@ class States(eqx.Module):
 
 
 class _Held(NamedTuple):
-    """A tool in this step: its next state, its way, whether it is on its place, its pose is known."""
+    """A tool in this step: its next state and way; it is on its place; its pose is known."""
 
     state: Any
     made: Any
@@ -56,11 +57,9 @@ def move_tools(
     """
     paths = [Poses(R[None], T[None]) for R, T in zip(rotation, translation, strict=True)]
     views = [scene_of(scene, instrument) for instrument in scene.instruments]
+    each = zip(views, states.tools, paths, touch_together(scene, paths), present, strict=True)
     held = [
-        _hold(view, material, *one)
-        for view, *one in zip(
-            views, states.tools, paths, touch_together(scene, paths), present, strict=True
-        )
+        _hold(view, material, state, path, seen, there) for view, state, path, seen, there in each
     ]
     there = present
     if scene.plan.options.contact == "bonded":

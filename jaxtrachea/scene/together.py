@@ -20,14 +20,16 @@ from jaxtrachea.mechanics.influence import Influence, influence, level_influence
 from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond
 from jaxtrachea.scene import dents
 from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
-from jaxtrachea.scene.stage import Poses, Presses, Scene, scene_of
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import place
+
 
 class Together(NamedTuple):
     """What the surface follows from; mm, rad. Contacts in the order of the tools.
@@ -65,7 +67,7 @@ def views(scene: Scene) -> list[Scene]:
 @full_precision
 def press_together(
     scene: Scene,
-    material: Material,
+    material: Any,
     paths: Sequence[Poses | Presses],
     made: Sequence[Approach | None],
     present: Bool[Array, "rows m"] | None = None,
@@ -84,13 +86,13 @@ def press_together(
     each = views(scene)
     safe, bad = without_negative_values(scene, material)
     given = [path if isinstance(path, Presses) else None for path in paths]
-    found = [refuse(*one, bad) for one in zip(each, [safe] * len(each), given, made, strict=True)]
+    found = [refuse(v, safe, p, m, bad) for v, p, m in zip(each, given, made, strict=True)]
     refused = {
         code: functools.reduce(jnp.logical_or, (r[code] for *_, r in found if code in r))
         for code in dict.fromkeys(code for *_, r in found for code in r)
     }
     hidden = functools.reduce(jnp.logical_or, refused.values())
-    presses, used, inward = ([one[i] for one in found] for i in range(3))
+    presses, used = [p for p, *_ in found], [u for _, u, *_ in found]
     D = jnp.stack([-p.displacement[:, 1] for p in presses], axis=1)
     D = jnp.where(hidden[:, None], 0, D)
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
@@ -104,21 +106,17 @@ def press_together(
     )
     if scene.plan.options.coupling == "total":
         depth = jnp.where(force == 0, 0, D - skeleton)
-    moved = Together(
-        s, phi, skeleton, depth, joints, slopes, turns, list(made), paths, hidden
-    )
+    moved = Together(s, phi, skeleton, depth, joints, slopes, turns, list(made), paths, hidden)
     vectors = {"force": force, "depth": depth, "skeleton": skeleton}
     rings = {"joints": joints, "loads": loads, "end_U": joints, "end_V": joints}
     asked = {"joints": scene.plan.joints, "loads": scene.plan.joints}
     fields = mask_rows(hidden, {n: _anterior(-v) for n, v in (vectors | rings).items()})
     fields |= {n: None for n in rings if not asked.get(n, scene.plan.ring_ends)}
     share = [
-        depth_share(v, fields["depth"][:, j], fields["skeleton"][:, j], inward[j])
+        depth_share(v, fields["depth"][:, j], fields["skeleton"][:, j], found[j][2])
         for j, v in enumerate(each)
     ]
-    status = [
-        status_of(solved[:, j], share[j], made[j], refused) for j in range(len(each))
-    ]
+    status = [status_of(solved[:, j], share[j], made[j], refused) for j in range(len(each))]
     ways = [m for m in made if m is not None]
 
     def stack(values):
@@ -130,7 +128,7 @@ def press_together(
         "displacement": stack([p.displacement for p in presses]),
         "frame": stack([m.frame for m in ways if m.frame is not None]),
         "depth_share": stack(share),
-        "contact_share": stack([contact_share(*one) for one in zip(each, [m.own for m in ways])]),
+        "contact_share": stack([contact_share(v, m.own) for v, m in zip(each, ways, strict=False)]),
         "status": _in_space(each, paths, stack(status)),
     }, moved  # fmt: skip
 
@@ -223,9 +221,7 @@ def deform_together(scene: Scene, moved: Together) -> Float[Array, "rows vertice
         def slope(v):
             return jnp.stack([-v, jnp.zeros_like(v)], -1)
 
-        keys = regions.clamped(
-            places[order], C[order], y, y, y, slope(slopes), slope(turns)[order]
-        )
+        keys = regions.clamped(places[order], C[order], y, y, y, slope(slopes), slope(turns)[order])
         u = regions.interpolate(binding, share, keys, method=method)
         if laid is not None and runs is not None:
             for dent, s in zip(dents.fit(laid, depth), moved.s, strict=True):

@@ -327,7 +327,7 @@ def add_correction(
 
 
 def kernel(points, centres, reach):
-    """psi between points and centres: 1 at a centre, 0 from `reach` on; (points, centres)."""
+    """Psi between points and centres: 1 at a centre, 0 from `reach` on; (points, centres)."""
     return _psi(_distance(points, centres, reach))
 
 

@@ -2,9 +2,9 @@ r"""Global shape: the motion of the skeleton's key points carried to every verte
 
 The key points lie on three lines along the tube: J at phi_c, and the ring ends U at -alpha and V at
 +alpha; on each, at the clamp A, the rings and the clamp B (the nodes). The contact C splits the J
-line; of a tool with a width its two edges do, of several tools all contacts. Along the tube a vertex lies in a patch between two
-nodes, round the tube in one of three regions, U-J, J-V and the back V-U. The three lines are
-interpolated along s, then linearly in phi.
+line; of a tool with a width its two edges do, of several tools all contacts. Along the tube a
+vertex lies in a patch between two nodes, round the tube in one of three regions, U-J, J-V and the
+back V-U. The three lines are interpolated along s, then linearly in phi.
 
 - `linear`: displacement vectors, linear between the key points.
 - `hermite` (default): the same, but the transverse displacement of the J line is the beam's cubic,

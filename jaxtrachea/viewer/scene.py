@@ -108,7 +108,7 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
 
 def _rubs(spec: SceneSpec) -> bool:
     """Whether a tool of this scene sticks and slides by Coulomb's law."""
-    known = spec.tool is not None and spec.tool.friction is not None
+    known = isinstance(spec.tool, ToolSection) and spec.tool.friction is not None
     wished = spec.effects.friction != "off" and spec.effects.contact_point != "per_step"
     return (
         known and wished and (spec.model.contact, spec.model.coupling) == ("unilateral", "series")
