@@ -342,7 +342,7 @@ def _write_json(folder: Path, made: dict) -> None:
 
 
 def _print_failures(status, what: str) -> int:
-    """A line for each status beyond contact and none; the number of all these."""
+    """A line for each status beyond contact and none; the number of those that are a fault."""
     import numpy as np
 
     from jaxtrachea.status import PressStatus
@@ -351,7 +351,7 @@ def _print_failures(status, what: str) -> int:
     failed = failed[failed > PressStatus.NO_CONTACT]
     for code, count in zip(*np.unique(failed, return_counts=True), strict=True):
         Console().print(f"{count} {what}: {PressStatus(int(code)).message}", highlight=False)
-    return len(failed)
+    return int(np.sum(failed != PressStatus.LIFTED))
 
 
 def _print_rows(out, names) -> None:

@@ -74,19 +74,16 @@ def _check_clocks(names: list[str], paths: list[Presses | Poses]) -> None:
         raise ValueError(f"path of tool {without!r} has no time; expected one, as {other!r} has")
     first = paths[0].time
     for name, path in zip(names[1:], paths[1:], strict=True):
-        if (
-            first is None
-            or path.time is None
-            or any(isinstance(v, Tracer) for v in (first, path.time))
-        ):
+        if first is None or any(isinstance(v, Tracer) for v in (first, path.time)):
             continue
         a, b = np.asarray(first), np.asarray(path.time)
-        both = min(len(a), len(b))
-        if len(a) != len(b) or (a != b).any():
-            row = int(np.argmax(a[:both] != b[:both])) + 1 if (a[:both] != b[:both]).any() else both
+        most = min(len(a), len(b))
+        unlike = np.flatnonzero(a[:most] != b[:most])
+        if len(unlike) or len(a) != len(b):
+            row = int(unlike[0]) if len(unlike) else most
             raise ValueError(
-                f"path of tool {name!r} has another time than that of {names[0]!r}, from row {row} "
-                f"on ({len(b)} rows, {len(a)} rows); expected the same times, row by row"
+                f"path of tool {name!r} has {len(b)} rows and that of {names[0]!r} {len(a)}, and "
+                f"their times differ from row {row + 1} on; expected one clock: the same times"
             )
 
 
@@ -94,10 +91,9 @@ def touch_together(scene: Scene, paths: Sequence[Poses]) -> list[Touch]:
     """As `touch_tube`, of every instrument; those that are alike in kind share one program."""
     found: dict[int, Touch] = {}
     alike: dict[Any, list[int]] = {}
-    for i, tool in enumerate(scene.instruments):
-        alike.setdefault((jax.tree.map(jnp.shape, tool.tool), tool.near, tool.quality), []).append(
-            i
-        )
+    for i, one in enumerate(scene.instruments):
+        shapes = tuple(v.shape for v in jax.tree.leaves(one.tool))
+        alike.setdefault((shapes, one.near, one.quality), []).append(i)
     for (_, near, quality), which in alike.items():
         chosen = [
             (scene.instruments[i].tool, paths[i].rotation, paths[i].translation) for i in which

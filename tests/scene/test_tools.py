@@ -40,7 +40,8 @@ from jaxtrachea.trachea.tube import make_tube
 OK, NO_CONTACT, LIFTED = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.LIFTED
 #: Round, with a vertex at every contact below: s is a multiple of 5 at the ends, 10/3 within.
 ROUND = make_tube(TUBE, around=9, along=40, relief=0.0)
-LEFT, RIGHT = presses([0, -4, 0], s=70.0, rows=5), presses([0, -1.2, 0], s=80.0)
+NEXT = 70 + 20 / 3
+LEFT, RIGHT = presses([0, -4, 0], s=70.0, rows=5), presses([0, -1.2, 0], s=NEXT)
 PRESSED = {"left": LEFT, "right": RIGHT}
 
 
@@ -64,7 +65,7 @@ def ways(*paths):
 
 def test_forces_are_those_of_press_contacts():
     out, D = pressed(), ways(LEFT, RIGHT)
-    found = press_contacts(TUBE, SPRINGS, [70.0, 80.0], D)
+    found = press_contacts(TUBE, SPRINGS, [70.0, NEXT], D)
     np.testing.assert_allclose(-out.force[:, :, 1], found.force, rtol=0, atol=1e-15)
     np.testing.assert_allclose(-out.joints[:, :, 1], found.joints, rtol=0, atol=1e-15)
     np.testing.assert_allclose(-out.loads[:, :, 1], found.reactions, rtol=0, atol=1e-15)
@@ -77,15 +78,16 @@ def test_surface_passes_through_every_contact():
     """The vertex at a contact moves as the tool does, to the last digits; the far ones do not."""
     out, D = pressed(), ways(LEFT, RIGHT)
     there = (np.abs(ROUND.phi) < 1e-9) & np.isclose(ROUND.distance, 12.6)
-    for j, s in enumerate((70.0, 80.0)):
+    for j, s in enumerate((70.0, NEXT)):
         (vertex,) = np.flatnonzero(there & np.isclose(ROUND.s, s))
         moved = out.vertices[:, vertex] - np.asarray(ROUND.vertices)[vertex]
         touching = out.status[:, j] == OK
         np.testing.assert_allclose(-moved[touching, 1], D[touching, j], rtol=0, atol=1e-9)
     far = np.abs(np.asarray(ROUND.s) - 75) > 70
-    assert np.abs(out.vertices[:, far] - np.asarray(ROUND.vertices)[far]).max() < 1e-6
+    assert np.abs(out.vertices[:, far] - np.asarray(ROUND.vertices)[far]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_surface_of_one_pressing_tool_is_that_of_one_tool():
     """A second tool that stays off the wall changes nothing."""
     away = presses([0, 3.0, 0], s=83.0, rows=5)
@@ -97,6 +99,7 @@ def test_surface_of_one_pressing_tool_is_that_of_one_tool():
     np.testing.assert_allclose(out.vertices, one.vertices, rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_order_of_tools_does_not_matter():
     turned = dict(reversed(PRESSED.items()))
     scene = make_scene(TUBE, SPRINGS, turned, mesh=ROUND)
@@ -119,13 +122,13 @@ def test_mapping_of_one_tool_has_the_axis():
     assert out.joints.shape == one.joints.shape
 
 
-@pytest.mark.parametrize("coupling", ["series", "total"])
+@pytest.mark.parametrize("coupling", ["series", *late("total")])
 def test_apart_every_force_is_that_of_its_tool_alone(coupling):
     wished = {"coupling": coupling} if coupling == "total" else {"tools": "apart"}
     scene = scene_of_presses(want_surface=False, **wished)
     assert scene.plan.tools == "apart"
     out = simulate(scene, SPRINGS, PRESSED)
-    for j, (s, D) in enumerate(zip((70.0, 80.0), ways(LEFT, RIGHT).T, strict=True)):
+    for j, (s, D) in enumerate(zip((70.0, NEXT), ways(LEFT, RIGHT).T, strict=True)):
         alone = press_contacts(TUBE, SPRINGS, [s], D[:, None]).force[:, 0]
         if coupling == "total":
             alone = SPRINGS.k_1 * D + SPRINGS.k_3 * D**3
@@ -146,7 +149,7 @@ def test_a_row_in_which_one_is_refused_has_no_numbers():
     assert (np.asarray(out.status)[1:] == PressStatus.OFF_TUBE).all()
 
 
-@pytest.mark.parametrize("half_width", [0.0, *late(2.0)])
+@pytest.mark.parametrize("half_width", late(0.0, 2.0))
 def test_glued_tools_and_widths(half_width):
     model = {"contact": "bonded", "half_width": half_width}
     scene = scene_of_presses(want_surface=False, **model)
@@ -157,7 +160,7 @@ def test_glued_tools_and_widths(half_width):
     np.testing.assert_allclose(-out.force[:, :, 1], found.force, rtol=0, atol=1e-14)
 
 
-@late()
+@pytest.mark.slow
 def test_float32():
     def low(tree):
         return jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), tree)
@@ -168,6 +171,7 @@ def test_float32():
     np.testing.assert_allclose(out.force, pressed().force, rtol=0, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_against_differences():
     """Forces, joints and surface by places, ways and material, forward and reverse."""
     scene = scene_of_presses()
@@ -234,6 +238,7 @@ def balls():
     return scene, jax.device_get(simulate(scene, SPRINGS, TWO_BALLS))
 
 
+@pytest.mark.slow
 def test_balls_press_where_they_touch():
     """Place and way by geometry, forces by `press_contacts` there; the surface meets both balls."""
     scene, out = balls()
@@ -247,6 +252,7 @@ def test_balls_press_where_they_touch():
     assert 1.02 < alone.force[-1, 0] / found.force[-1, 0]  # the other ball has made way
 
 
+@pytest.mark.slow
 def test_files_have_all_tools(tmp_path):
     scene, out = balls()
     write_forces(tmp_path / "forces.csv", out, scene.names)
@@ -260,7 +266,7 @@ def test_files_have_all_tools(tmp_path):
     np.testing.assert_array_equal(read.path["right"].translation, TWO_BALLS["right"].translation)
 
 
-@late()
+@pytest.mark.slow
 def test_a_session_goes_the_same_way():
     scene, out = balls()
     session = Session(scene, SPRINGS)
@@ -348,7 +354,7 @@ def test_what_does_not_go_together():
         ({"several_points": True}, {}, "contact_point 'fixed'"),
         ({"poses": True, "slip": 40.0, "spacing": 10.0}, {}, "does not keep its place"),
         ({"slip": 1.0, "along": 0.5, "friction": True}, {}, "with friction 'off'"),
-        ({"known": frozenset({"sections"})}, {}, r"give \[material\] in the place of"),
+        ({"known": frozenset({"sections"})}, {"contact": "bonded"}, r"give \[material\] in the place of"),
         ({"known": frozenset({"relaxation"}), "timed": True}, {}, "set relaxation 'off'"),
         ({"known": frozenset({"e_1", "e_2"}), "way_fixed": (0.0, 0.2), "softness": (-1.4, 0.9)}, {},
          "set skeleton 'linear'"),
@@ -397,7 +403,8 @@ positions = [["80 mm", "16 mm", "0 mm"]]
         ('[[tool]]\nname = "left"', "[plan]\ntolerance = \"1 %\"\n[[tool]]\nname = \"left\"",
          "plan: a tolerance is for one tool"),
         ('radius = "4 mm"', 'radius = "4 mm"\nlength = "3 mm"', "length: not for shape 'sphere'"),
-        ('[[path]]\ntool = "left"', "[output]\nplay = true\n[[path]]\ntool = \"left\"", "output.play"),
+        ('[[path]]\ntool = "left"', '[output]\nplay = true\n[[path]]\ntool = "left"',
+         "output.play"),
     ],
 )  # fmt: skip
 def test_tables_that_do_not_belong_together(old, new, words):
@@ -410,12 +417,12 @@ def test_one_tool_has_no_name():
     one = {"shape": "sphere", "radius": "5 mm"}
     path = {"positions": [["70 mm", "17 mm", "0 mm"]]}
     material = tomllib.loads(TOOLS)["material"]
-    for tool, path, words in (
+    for tool, leg, words in (
         (one | {"name": "left"}, path, "tool.name: of several tools alone"),
         (one, path | {"tool": "left"}, r"path.0.tool: there is one \[tool\]"),
     ):
         with pytest.raises(ValueError, match=words):
-            SceneSpec.model_validate({"material": material, "tool": tool, "path": [path]})
+            SceneSpec.model_validate({"material": material, "tool": tool, "path": [leg]})
     many = [{"shape": "sphere", "radius": "5 mm", "name": f"{i}"} for i in range(17)]
     with pytest.raises(ValueError, match="17 tools; expected at most 16"):
         SceneSpec.model_validate({"material": material, "tool": many, "path": [path]})
