@@ -142,6 +142,7 @@ TYPES = {
     "dict[str, ParameterSection]": ("table of tables", ""),
     "list[PathSection]": ("tables", ""),
     "list[PartSection]": ("tables", ""),
+    "Tools": ("table, or tables", ""),
 }
 
 

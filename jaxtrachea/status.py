@@ -60,6 +60,7 @@ class PressStatus(_Described):
     BACK_IN_TIME = 15, "the time is before that of an earlier sample, or no number"
     LIFTED = 16, "solved, without a force: another tool holds the wall away from this one"
     NOT_CONVERGED = 17, "the contacts are not in balance: too stiff for these digits; use float64"
+    TOOLS_OVERLAP = 18, "solved, but this tool and another overlap in space: lead them apart"
 
     @property
     def solved(self) -> bool:
@@ -72,6 +73,7 @@ class PressStatus(_Described):
             PressStatus.NEAR_RING_END,
             PressStatus.EXTRAPOLATED,
             PressStatus.LIFTED,
+            PressStatus.TOOLS_OVERLAP,
         )
 
 

@@ -99,7 +99,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
         title = spec.title or scene.stem
         with beside(_draw, folder, title, spec.output.pictures, staged, out) as drawing:
             write_meshes(folder, staged.scene, out)
-            write_forces(folder / "forces.csv", out)
+            write_forces(folder / "forces.csv", out, staged.scene.names)
             made = _provenance(scene, staged, clock)
             motion = staged.material, staged.path
             write_simulation(folder / "simulation.h5", staged.scene, *motion, out, made)
@@ -108,7 +108,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 _write_recording(folder, spec.output)
             _write_json(folder, made)
             say_lost(drawing.result() | lost)
-    _print_rows(out)
+    _print_rows(out, staged.scene.names)
     failed = _print_failures(out.status, "row(s)")
     for note in staged.notes:
         Console().print(escape(note), highlight=False)
@@ -284,10 +284,10 @@ def _default(scene: Path, ending: str = "") -> Path:
 
 
 def _rows(staged) -> int:
-    from jaxtrachea.scene.stage import Presses
+    from jaxtrachea.scene.instruments import rows_of
 
-    path = staged.path
-    return len(path.s if isinstance(path, Presses) else path.translation)
+    paths = staged.path.values() if staged.scene.instruments else [staged.path]
+    return max(map(rows_of, paths))
 
 
 def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, str]:
@@ -295,12 +295,14 @@ def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, st
     if not pictures:
         return {}
     from jaxtrachea.files.pictures import save_each
-    from jaxtrachea.scene.plots import draw_series
+    from jaxtrachea.scene.plots import draw_series, draw_tools
     from jaxtrachea.scene.results import last_solved
     from jaxtrachea.scene.surface_plot import draw_surface
 
-    shown = staged.scene, staged.path, out
+    shown, names = (staged.scene, staged.path, out), staged.scene.names
     drawings = {"series.png": partial(draw_series, *shown)}
+    if names:
+        drawings = {"series.png": partial(draw_tools, names, out)}
     row = last_solved(out)
     if out.vertices is not None and row is not None:
         drawings["surface.png"] = partial(draw_surface, *shown, row, title)
@@ -359,7 +361,7 @@ def _write_json(folder: Path, made: dict) -> None:
 
 
 def _print_failures(status, what: str) -> int:
-    """A line for each status beyond contact and none; the number of all these."""
+    """A line for each status beyond contact and none; the number of those that are a fault."""
     import numpy as np
 
     from jaxtrachea.status import PressStatus
@@ -368,26 +370,31 @@ def _print_failures(status, what: str) -> int:
     failed = failed[failed > PressStatus.NO_CONTACT]
     for code, count in zip(*np.unique(failed, return_counts=True), strict=True):
         Console().print(f"{count} {what}: {PressStatus(int(code)).message}", highlight=False)
-    return len(failed)
+    return int(np.sum(failed != PressStatus.LIFTED))
 
 
-def _print_rows(out) -> None:
-    """A table of the rows: of more than `MANY` some, evenly, which its title says."""
+def _print_rows(out, names) -> None:
+    """A table of the rows: of more than `MANY` some, evenly, which its title says.
+
+    Of several tools a line for each of them.
+    """
     import numpy as np
 
     from jaxtrachea.files.table import Column, Table
+    from jaxtrachea.scene.simulation import of_tool
     from jaxtrachea.status import PressStatus
 
     count = len(out.s)
     pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
 
-    def row(i: int) -> dict[str, object]:
+    def row(i: int, out, name: str) -> dict[str, object]:
         def rounded(x) -> float:
             return float(np.round(x, 9) + 0.0)
 
         vectors = {"force {} [N]": out.force[i], "skeleton {} [mm]": out.skeleton[i]}
         cells: dict[str, object] = {
             "row": i + 1,
+            **({"tool": name} if name else {}),
             "s [mm]": float(out.s[i]),
             "phi [deg]": rounded(np.degrees(out.phi[i])),
             "gap [mm]": None if out.gap is None else rounded(out.gap[i]),
@@ -401,7 +408,7 @@ def _print_rows(out) -> None:
         }
 
     columns = [
-        Column("row"), Column("s [mm]"),
+        Column("row"), *([Column("tool", left=True)] if names else []), Column("s [mm]"),
         *(Column(name, digits=3) for name in ("phi [deg]", "gap [mm]")),
         *(Column(f"force {axis} [N]", digits=3) for axis in "xyz"), Column("status", left=True),
         Column("depth/radius", unit="%", decimals=0),
@@ -410,4 +417,6 @@ def _print_rows(out) -> None:
     title = f"{count} rows"
     if len(pick) < count:
         title = f"{len(pick)} of {count} rows; all are in simulation.h5"
-    Console().print(table(Table(map(row, pick.tolist()), columns, title=title)))
+    each = [(of_tool(out, j), name) for j, name in enumerate(names)] or [(out, "")]
+    lines = (row(i, *one) for i in pick.tolist() for one in each)
+    Console().print(table(Table(lines, columns, title=title)))

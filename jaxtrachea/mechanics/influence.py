@@ -28,11 +28,17 @@ class Influence(NamedTuple):
         joints: deflection of the ligament at each ring per unit force at contact j, mm/N; shape
             (m, rings).
         reactions: force of each ring against the load per unit force at contact j; (m, rings).
+        slopes: rotation of the ligament at each ring per unit force at contact j, rad/N; shape
+            (m, rings).
+        turns: rotation of the ligament at every contact (of punches: at the edges towards A of all,
+            then at those towards B) per unit force at contact j, rad/N; shape (m, points).
     """
 
     compliance: Float[Array, "m m"]
     joints: Float[Array, "m rings"]
     reactions: Float[Array, "m rings"]
+    slopes: Float[Array, "m rings"]
+    turns: Float[Array, "m points"]
 
 
 def influence(beam: Beam, s: Float[Array, " m"]) -> Influence:
@@ -55,28 +61,33 @@ def influence(beam: Beam, s: Float[Array, " m"]) -> Influence:
     at = jnp.stack([marks, supports - 1 - marks])  # seen from A, and from B
     tips = jax.tree.map(lambda v: jax.vmap(picked)(v, at), nodes.g)
     joint = jax.vmap(lambda tip: join(*sides(tip)), in_axes=1)(tips)
-    w = jax.vmap(_back_substitute)(both, nodes.g, past, at, joint.V.T, joint.M.T)
-    w = jnp.where(jnp.arange(supports)[:, None] <= marks[None], w[0], w[1][::-1])
+    w, theta = jax.vmap(_back_substitute)(both, nodes.g, past, at, joint.V.T, joint.M.T)
+    in_A = jnp.arange(supports)[:, None] <= marks[None]
+    w = jnp.where(in_A, w[0], w[1][::-1])
+    theta = jnp.where(in_A, theta[0], -theta[1][::-1])
     C = w[marks]
     C = jnp.where(jnp.eye(m, dtype=bool), joint.w[:, None], (C + C.T) / 2)
-    joints = without_marks(w, passed, m).T
-    return Influence(C, joints, joints * beam.k[None])
+    joints, slopes = (without_marks(v, passed, m).T for v in (w, theta))
+    return Influence(C, joints, joints * beam.k[None], slopes, theta[marks].T)
 
 
-def _back_substitute(side: Side, tips: Compliance, past, at, V, M) -> Float[Array, "supports m"]:
-    """From m loads (V, M), each at its mark, back to the clamp: motion of every support, mm.
+def _back_substitute(
+    side: Side, tips: Compliance, past, at, V, M
+) -> tuple[Float[Array, "supports m"], Float[Array, "supports m"]]:
+    """From m loads (V, M), each at its mark, back to the clamp: motion and rotation of supports.
 
     Nothing moves beyond a mark here: that is for the other side.
     """
 
     def step(load, support):
-        index, h, k, past, a, b = support
+        index, h, k, past, (a, b, c, _) = support
         begins = index == at
         M_here = jnp.where(begins, M, load[1] + h * load[0])
         V_here = jnp.where(begins, V, load[0])
-        return (past * V_here - k * b * M_here, M_here), a * V_here + b * M_here
+        moved = a * V_here + b * M_here, b * V_here + c * M_here
+        return (past * V_here - k * b * M_here, M_here), moved
 
-    supports = (jnp.arange(side.k.shape[0]), side.h[1:], side.k, past, tips.a, tips.b)
+    supports = (jnp.arange(side.k.shape[0]), side.h[1:], side.k, past, tips)
     return jax.lax.scan(step, (jnp.zeros_like(V), jnp.zeros_like(M)), supports, reverse=True)[1]
 
 
@@ -103,7 +114,7 @@ def level_influence(beam: Beam, s: Float[Array, " m"], half_width: float) -> Inf
         return jnp.concatenate([(v[:m] + v[m:]) / 2, v[:m] - v[m:]])
 
     C = turned(turned(found.compliance).T).T
-    joints, reactions = turned(found.joints), turned(found.reactions)
+    rest = [turned(v) for v in (found.joints, found.reactions, found.slopes, found.turns)]
     size = (jnp.diag(found.compliance)[:m] + jnp.diag(found.compliance)[m:])[:, None]
     tiny = 100 * epsilon(C.dtype) * size[:, 0]
     narrow = jnp.any((jnp.diag(C)[m:] <= tiny) & (tiny > 0))
@@ -112,10 +123,10 @@ def level_influence(beam: Beam, s: Float[Array, " m"], half_width: float) -> Inf
         known = pivot > tiny[j]
         share = jnp.where(known, row / jnp.where(known, pivot, 1), 0)[:, None]
         C = C - share * row[None]
-        joints = joints - share * joints[m + j][None]
-        reactions = reactions - share * reactions[m + j][None]
+        rest = [v - share * v[m + j][None] for v in rest]
     C = jnp.where(narrow, jnp.nan, C[:m, :m])
-    return Influence((C + C.T) / 2, joints[:m], reactions[:m])
+    joints, reactions, slopes, turns = (v[:m] for v in rest)
+    return Influence((C + C.T) / 2, joints, reactions, slopes, turns)
 
 
 def _sorted_places(s: Float[Array, " m"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:

@@ -1,6 +1,6 @@
 """From the tool's positions to presses at contact points: where it touches, and how far it goes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -11,6 +11,7 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.instruments import scene_of, touch_together
 from jaxtrachea.scene.landing import Landing, landing
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
@@ -48,7 +49,19 @@ def approach(scene: Scene, path: Poses) -> Approach:
     """Let the tool touch the tube at rest, and say what it does to the place it touches."""
     if scene.plan.contact_point == "per_step":
         return _on_its_own(scene, path)
-    seen = touch_tube(scene, path)
+    return _on_first_touch(scene, path, touch_tube(scene, path))
+
+
+@full_precision
+def approach_together(scene: Scene, paths: Sequence[Poses]) -> list[Approach]:
+    """As `approach`, of all instruments of a scene; each keeps its place."""
+    views = [scene_of(scene, instrument) for instrument in scene.instruments]
+    each = zip(views, paths, touch_together(scene, paths), strict=True)
+    return [_on_first_touch(*one) for one in each]
+
+
+def _on_first_touch(scene: Scene, path: Poses, seen: Touch) -> Approach:
+    """The path as presses on the place that the tool touches first."""
     inside = in_lumen(scene, path, seen)
     return on_one_point(scene, path, seen, first_touch(seen, inside)[1], inside)
 

@@ -1,7 +1,7 @@
 """A scene put together: what is there, its program, and the same with another skeleton or mesh."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +12,23 @@ from jaxtrachea.contact.search import STANDARD
 from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.levels.relaxing import long_run
+from jaxtrachea.mechanics.press_contacts import MOST_CONTACTS
 from jaxtrachea.mechanics.sections.wall import Points, gather_points
 from jaxtrachea.scene.declare import PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
-from jaxtrachea.scene.facts import facts_of
+from jaxtrachea.scene.facts import facts_of, facts_together
+from jaxtrachea.scene.instruments import paths_in_order, rows_of, scene_of
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import OUTER, RADIUS, check_sizes, check_width
-from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool, check_material, check_path
+from jaxtrachea.scene.stage import (
+    Instrument,
+    Poses,
+    Presses,
+    Scene,
+    Tool,
+    check_material,
+    check_path,
+)
 from jaxtrachea.scene.wall import checked_walls, contact_settings, near_patches, round_wall
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
@@ -29,14 +39,16 @@ from jaxtrachea.trachea.mesh import Mesh
 FOOTPRINT, LEAST = 0.6, 4.0
 #: Of a tool that a program does not fit.
 CURE = "make a scene for this tool (a program for the largest tool serves smaller ones)"
+#: Tools of one scene, at most.
+MOST_TOOLS = MOST_CONTACTS
 
 
 def make_scene(
     geometry: Geometry,
     material: AnyMaterial,
-    path: Poses | Presses,
+    path: Poses | Presses | Mapping[str, Poses | Presses],
     *,
-    tool: Tool | Shape | None = None,
+    tool: Tool | Shape | None | Mapping[str, Tool | Shape] = None,
     mesh: Mesh | None = None,
     radius: float | None = None,
     effects: EffectOptions = EffectOptions(),
@@ -48,9 +60,11 @@ def make_scene(
         geometry: the tube at rest.
         material: read only for which optional values are there; a `SectionMaterial` makes a scene
             of deforming cross-sections.
-        path: what the plan is made for; other paths may follow if they need no more.
+        path: what the plan is made for; other paths may follow if they need no more. Several tools
+            have a mapping of their names to paths: they move side by side and feel one another.
         tool: with its friction, or its shape alone, in any dtype: the scene has that of
-            `geometry`; a shape is needed for `Poses`.
+            `geometry`; a shape is needed for `Poses`. For a mapping of paths a mapping of the same
+            names; None for presses.
         mesh: the surface; without one `effects.want_surface` must be false. Of deforming
             cross-sections a straight one only follows: a tool touches a round wall of `radius`.
         radius: of the tube's outside, mm; None: of a `SectionMaterial` that of its mid-line and
@@ -61,56 +75,124 @@ def make_scene(
         progress: called with (patches of the wall done since the last call, patches in all).
 
     Raises:
-        PlanError: a wish that cannot be met.
+        PlanError: a wish that cannot be met, such as several tools where contacts are not coupled.
         MeshError: patches for the contact that are not where the mesh is.
         SizeError: a length that no trachea and no tool has: the unit is wrong, most likely; a
             `half_width` beyond the tool.
         ValueError: a path without rows, arrays of a wrong length, or matrices of the path that are
-            no rotations; what is no tube, material, path, tool, mesh or no options.
+            no rotations; what is no tube, material, path, tool, mesh or no options; more than 16
+            tools, tools and paths of different names, two tools on one and the same path.
     """
-    check_path(path)
+    paths, tools = _named(path, tool)
     check_material(geometry, material)
-    check_word("tool", tool, Tool | Shape | None)
     check_word("mesh", mesh, Mesh | None)
     check_word("effects", effects, EffectOptions)
-    if not len(path.s if isinstance(path, Presses) else path.translation):
-        raise ValueError("path has no rows; expected at least one")
-    tool = tool if isinstance(tool, Tool) else Tool(tool)
+    moves = isinstance(next(iter(paths.values())), Poses)
     dtype = geometry.length.dtype
-    shape = jax.tree.map(lambda v: jnp.asarray(v, dtype), tool.shape)
-    friction = tool.friction
+    shapes = {n: jax.tree.map(lambda v: jnp.asarray(v, dtype), t.shape) for n, t in tools.items()}
     kind = level_type(material)
     own, sections = kind.thickness(long_run(material)), not kind.hangs_on_rings
     if radius is None and own is not None:
         outer = geometry.radius + own / 2
     else:
         outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
-    check_sizes(geometry, float(outer), shape)
-    if isinstance(path, Poses) and shape is None:
-        raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
-    tube, near, quality = None, 1, STANDARD
-    if shape is not None and isinstance(path, Poses):
+    tube = None
+    for shape in shapes.values():
+        check_sizes(geometry, float(outer), shape)
+        if moves and shape is None:
+            raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
+    if moves:
         if mesh is None or (sections and mesh.frames is None):
             tube = round_wall(geometry, float(outer))
         else:
             tube = checked_walls(geometry, mesh, progress)
-        near = near_patches(shape, geometry, tube.centres.shape[0])
-        quality = contact_settings(shape, geometry)
-    mu = None if friction is None else jnp.asarray(friction, dtype)
+    instruments = []
+    for name, shape in shapes.items():
+        near, quality, mu = 1, STANDARD, tools[name].friction
+        if shape is not None and tube is not None:
+            near = near_patches(shape, geometry, tube.centres.shape[0])
+            quality = contact_settings(shape, geometry)
+        instruments.append(Instrument(
+            name=name, tool=shape, friction=None if mu is None else jnp.asarray(mu, dtype),
+            footprint=jnp.asarray(_footprint(shape, float(outer)), dtype), near=near,
+            quality=quality,
+        ))  # fmt: skip
     binding = None if mesh is None or sections else regions.bind(mesh, geometry)
-    spacing = jnp.asarray(_footprint(shape, float(outer)), dtype)
+    spacing = max((instrument.footprint for instrument in instruments), key=float)
     scene = Scene(
-        geometry=geometry, radius=outer, tube=tube, tool=shape, friction=mu, mesh=mesh,
-        binding=binding, footprint=spacing, near=near, quality=quality,
+        geometry=geometry, radius=outer, tube=tube, tool=None, friction=None, mesh=mesh,
+        binding=binding, footprint=spacing, near=1,
         plan=make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False)),  # not read
     )  # fmt: skip
-    facts = facts_of(scene, material, path, bonded=effects.contact == "bonded")
+    each = [scene_of(scene, instrument) for instrument in instruments]
+    bonded = effects.contact == "bonded"
+    facts = facts_together([
+        facts_of(view, material, p, bonded=bonded)
+        for view, p in zip(each, paths.values(), strict=True)
+    ])  # fmt: skip
+    if isinstance(path, Mapping):
+        scene = dataclasses.replace(scene, instruments=tuple(instruments))
+    else:
+        scene = each[0]
     plan = make_plan(facts, effects)
-    check_width(geometry, shape, plan.options.half_width)
+    for shape in shapes.values():
+        check_width(geometry, shape, plan.options.half_width)
     if plan.surface is None or mesh is None:
         return dataclasses.replace(scene, mesh=None, binding=None, plan=plan)
     runs, points = local.runs(mesh.s, spacing), _points(mesh) if sections else None
     return dataclasses.replace(scene, plan=plan, runs=runs, points=points)
+
+
+def _named(path, tool) -> tuple[dict[str, Poses | Presses], dict[str, Tool]]:
+    """Checked paths and tools by name; of a bare path by the empty one.
+
+    Raises:
+        ValueError: see `make_scene`.
+    """
+    if not isinstance(path, Mapping):
+        check_path(path)
+        check_word("tool", tool, Tool | Shape | None)
+        paths, tools = {"": path}, {"": tool}
+    else:
+        if not 1 <= len(path) <= MOST_TOOLS:
+            raise ValueError(f"path has {len(path)} tools; expected 1 to {MOST_TOOLS}")
+        names = [*path]
+        if tool is not None and not isinstance(tool, Mapping):
+            raise ValueError(
+                f"tool is {type(tool).__name__}; expected a mapping of the names of the paths: "
+                f"{', '.join(map(repr, names))}"
+            )
+        paths = dict(zip(names, paths_in_order(names, path), strict=True))
+        tools = dict.fromkeys(names) if tool is None else dict(tool)
+        if set(tools) != set(names):
+            raise ValueError(
+                f"tool has the names {', '.join(map(repr, tools))}; expected those of the paths: "
+                f"{', '.join(map(repr, names))}"
+            )
+        for name in names:
+            check_word(f"tool {name!r}", tools[name], Tool | Shape | None)
+        _check_apart(paths)
+        tools = {name: tools[name] for name in names}
+    if not min(map(rows_of, path.values() if isinstance(path, Mapping) else [path])):
+        raise ValueError("path has no rows; expected at least one")
+    return paths, {n: t if isinstance(t, Tool) else Tool(t) for n, t in tools.items()}
+
+
+def _check_apart(paths: Mapping[str, Poses | Presses]) -> None:
+    """Refuse two tools that are on one and the same path throughout.
+
+    Raises:
+        ValueError: naming both.
+    """
+    seen: dict[bytes, str] = {}
+    for name, path in paths.items():
+        key = b"".join(np.asarray(v).tobytes() for v in jax.tree.leaves(path))
+        if key in seen:
+            raise ValueError(
+                f"path of tool {name!r} is that of {seen[key]!r} in every row; expected tools in "
+                "different places: lead one of them elsewhere, or leave it out"
+            )
+        seen[key] = name
 
 
 def _points(mesh: Mesh) -> Points:

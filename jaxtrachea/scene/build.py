@@ -66,7 +66,7 @@ class Staged(NamedTuple):
 
     scene: Scene
     material: AnyMaterial
-    path: Poses | Presses
+    path: Poses | Presses | dict[str, Poses | Presses]
     files: tuple[Path, ...]
     notes: tuple[str, ...]
 
@@ -89,10 +89,8 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     notes += ends_not_given(spec)
     if mesh is None:
         mesh = _tube(spec.trachea, geometry, material)
-    tool = None
-    if spec.tool is not None:
-        shape, seen = _tool(spec.tool, folder, files)
-        tool, notes = Tool(shape, spec.tool.friction), notes + seen
+    tool, seen = _tools(spec.tool, folder, files)
+    notes += seen
     path = path_of(spec, folder, files, geometry)
     material = relaxing(spec, material, path)
     radius = float(geometry.radius) + spec.trachea.wall / 2
@@ -114,6 +112,10 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         raise _of_file(error) from None
     except SizeError as error:
         raise SpecError.like(error.renamed(KEYS)) from None
+    except ValueError as error:
+        if not spec.names:
+            raise
+        raise SpecError(f"path: {error}") from None  # paths of tools that do not go together
     if scene.tube is not None and scene.plan.mechanics.hangs_on_rings:
         lost, filled = float(scene.tube.lost.max()), float(scene.tube.filled.max())
         notes += (
@@ -151,11 +153,15 @@ def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
     return dataclasses.replace(wall, **named)
 
 
-def relaxing(spec: SceneSpec, material: AnyMaterial, path: Poses | Presses) -> AnyMaterial:
+def relaxing(
+    spec: SceneSpec, material: AnyMaterial, path: Poses | Presses | dict[str, Poses | Presses]
+) -> AnyMaterial:
     """The material with what [relaxation] says; `power` covers the times of the path."""
     if spec.relaxation is None:
         return material
     span = laws.Span(Options.shortest, Options.longest)
+    if isinstance(path, dict):
+        path = next(iter(path.values()))  # the clock is the same for all
     if path.time is not None:
         steps = np.diff(np.asarray(path.time))
         if (steps > 0).any():
@@ -191,8 +197,9 @@ def _uncounted(_: str) -> None:
 def dropped_effects(scene: Scene) -> tuple[str, ...]:
     """Friction that was asked for and is not in the program; levels that make numbers doubtful."""
     notes = []
+    rubs = any(v.friction is not None for v in (scene, *scene.instruments))
     for effect in scene.plan.effects:
-        if effect.name == "friction" and scene.friction is not None and not scene.plan.friction:
+        if effect.name == "friction" and rubs and not scene.plan.friction:
             notes.append(f"friction: off, {effect.reason}")
         if effect.caveat:
             notes.append(f"{effect.name}: {effect.level}, {effect.caveat}")
@@ -213,6 +220,7 @@ def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray)
     """
     assert spec.sweep is not None
     inward = np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], axis=1)
+    staged = staged._replace(scene=dataclasses.replace(staged.scene, instruments=()))
     bare = dataclasses.replace(staged.scene, mesh=None)
     facts = facts_of(bare, staged.material, Presses(s, phi, spec.sweep.depth * inward))
     bare_effects = dataclasses.replace(
@@ -289,15 +297,32 @@ def _of_file(error: InputError) -> SpecError:
     return SpecError.like(named, place="", key=key, joint=named.joint if named.key else ": ")
 
 
+def _tools(
+    section: ToolSection | list[ToolSection] | None, folder: Path, files: list[Path]
+) -> tuple[Tool | dict[str, Tool] | None, tuple[str, ...]]:
+    """The tool, or several by name; and notes on their files."""
+    if section is None:
+        return None, ()
+    if isinstance(section, ToolSection):
+        shape, notes = _tool(section, "tool", folder, files)
+        return Tool(shape, section.friction), notes
+    tools, notes = {}, ()
+    for i, one in enumerate(section):
+        shape, seen = _tool(one, f"tool.{i}", folder, files)
+        tools[one.name] = Tool(shape, one.friction)
+        notes += tuple(f"{one.name}: {note}" for note in seen)
+    return tools, notes
+
+
 def _tool(
-    section: ToolSection, folder: Path, files: list[Path]
+    section: ToolSection, key: str, folder: Path, files: list[Path]
 ) -> tuple[shapes.Shape, tuple[str, ...]]:
     """The shape of the tool, its parts where they stand, and notes on their files."""
     if section.parts is None:
-        return _shape(section, "tool", folder, files)
+        return _shape(section, key, folder, files)
     found, poses, notes = [], [], ()
     for i, part in enumerate(section.parts):
-        shape, seen = _shape(part, f"tool.parts.{i}", folder, files)
+        shape, seen = _shape(part, f"{key}.parts.{i}", folder, files)
         turn, place = part.rotation or [0.0] * 3, part.position or [0.0] * 3
         found.append(jax.tree.map(lambda v: jnp.asarray(v, float), shape))
         poses.append(pose_from_vector(jnp.asarray(turn, float), jnp.asarray(place, float)))
@@ -305,7 +330,7 @@ def _tool(
     try:
         return shapes.compound(found, poses), notes
     except ValueError as error:
-        raise SpecError(str(error).replace("shapes:", "tool.parts:", 1)) from None
+        raise SpecError(str(error).replace("shapes:", f"{key}.parts:", 1)) from None
 
 
 def _shape(

@@ -23,7 +23,7 @@ def shares(staged: Staged) -> tuple[int, dict[str, float]]:
         less = scene.plan.without(effect.name)
         if less is not None:
             found[effect.name] = 1 - count(dataclasses.replace(scene, plan=less)) / whole
-    if scene.plan.contact:
+    if scene.plan.contact and not scene.instruments:
         moved = jax.eval_shape(simulate, scene, staged.material, staged.path)
         given = jax.tree.map(
             lambda v: jnp.zeros(v.shape, v.dtype),

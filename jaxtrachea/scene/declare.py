@@ -52,6 +52,7 @@ class SceneFacts:
         softness: e_1 R and e_2 R^2 of the material, R the radius; 0 where they are not known.
         timed: whether the path has times.
         duration: from its first time to its last, s.
+        tools: number of tools with a path.
     """
 
     poses: bool = False
@@ -71,6 +72,7 @@ class SceneFacts:
     softness: tuple[float, float] = (0.0, 0.0)
     timed: bool = False
     duration: float = 0.0
+    tools: int = 1
 
 
 class Case(NamedTuple):

@@ -37,7 +37,7 @@ def deform(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach
     if mesh is None or binding is None or plan.surface is None or plan.surface == "sections":
         raise ValueError("scene.mesh or scene.binding is None; the plan has a surface")
     method = plan.surface
-    straight, (runs, radius, tool) = mesh.straight, _dent_parts(scene, path, made)
+    straight, (runs, radius, tool) = mesh.straight, dent_parts(scene, path, made)
     where = presses.s, presses.phi, radius, tool
     together = plan.contact_point == "fixed"
     if together:  # one contact point for all rows: what depends on it alone is computed once
@@ -97,7 +97,7 @@ def deform_sections(scene: Scene, presses: Presses, moved: Any, path: Any, made:
     plan, mesh, points = scene.plan, scene.mesh, scene.points
     if mesh is None or points is None:
         raise ValueError("scene.mesh or scene.points is None; the plan has a surface")
-    straight, (runs, radius, tool) = mesh.straight, _dent_parts(scene, path, made)
+    straight, (runs, radius, tool) = mesh.straight, dent_parts(scene, path, made)
     phi = presses.phi if plan.second_plane else jnp.zeros_like(presses.phi)
     shape = scene.geometry.radius, scene.geometry.half_angle
     at_rest = around(points, *shape)
@@ -127,7 +127,7 @@ def deform_sections(scene: Scene, presses: Presses, moved: Any, path: Any, made:
     return rows(vertices, jnp.nan)
 
 
-def _dent_parts(scene: Scene, path: Any, made: Approach | None):
+def dent_parts(scene: Scene, path: Any, made: Approach | None):
     """Order of the vertices, distance of the contacts from the centreline and the tool backed out.
 
     None: without a dent; what a dent without the tool's shape does not need.
@@ -165,8 +165,8 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
     def lay_out(s_c, phi_c, radius, tool, depth):
         where = centres(s_c, phi_c, radius)
         bent = scene.tube if scene.plan.curved else None
-        sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
-        return where, local.shares(depth, sag)
+        off = sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
+        return where, local.shares(depth, off)
 
     radius = scene.radius if radius is None else radius
     if tool is None or scene.tool is None:
@@ -179,7 +179,7 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
 
 # Inlined: traced once for all plans of a scene that are compared, as `stage.touch_tube`.
 @partial(jax.jit, inline=True)
-def _sag(tool: Shape, pose: Poses, points):
+def sag(tool: Shape, pose: Poses, points):
     """Distance of the tool, just touching, from points of the rest surface, mm."""
     if tool.radius.ndim == 1:
         return jnp.min(jax.vmap(_sag, (0, None, None))(tool, pose, points), axis=0)

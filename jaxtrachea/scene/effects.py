@@ -221,6 +221,56 @@ def _no_parts(case: Case) -> tuple[str, str] | None:
     return None
 
 
+def _tools(case: Case) -> Verdict:
+    """Whether contacts feel one another, by the number of tools.
+
+    Raises:
+        PlanError: several tools in a scene for which that is not derived.
+    """
+    count = case.facts.tools
+    if count == 1:
+        why = "one tool has a path", "leave it 'auto', or give a path to another tool"
+        return Verdict("one", "one tool", {"apart": why, "coupled": why})
+    if cannot := _no_company(case):
+        raise PlanError("tools", f"{count} tools press one tube", *cannot)
+    refused = {"one": (f"{count} tools have a path", "leave it 'auto'")}
+    if case.options.coupling == "total":
+        why = "with coupling 'total' no force knows the skeleton: contacts do not feel one another"
+        refused["coupled"] = why, "use coupling 'series'"
+        return Verdict("apart", f"{count} tools; {why}", refused)
+    return Verdict("coupled", f"{count} tools: the forces of all move each of them", refused)
+
+
+def _no_company(case: Case) -> tuple[str, str] | None:
+    """Why several tools cannot press together, and the cure; None: they can."""
+    levels, one_each = case.levels, "or simulate each tool by itself"
+    if SECTIONS in case.facts.known:
+        return (
+            "deforming cross-sections are derived for one contact",
+            f"give [material] in the place of [sections] and [wall], {one_each}",
+        )
+    if levels["contact_point"] != "fixed":
+        return (
+            "a tool does not keep its place (contact_point 'per_step')",
+            f"shorten its path along the surface, or set contact_point 'fixed', {one_each}",
+        )
+    if levels["second_plane"] != "off":
+        return (
+            "off the midline, obliquely, with friction or with rings that bend (second_plane 'on') "
+            "a coupling of contacts that is continuous in their angle is not derived",
+            "press straight in on the midline with friction 'off', contact_point 'fixed' and rings "
+            f"'mat', {one_each}",
+        )
+    if levels["skeleton"] != "linear":
+        return "a skeleton softens by one contact", f"set skeleton 'linear', {one_each}"
+    if levels["relaxation"] != "off":
+        return (
+            "a force that relaxes is derived for one contact",
+            f"set relaxation 'off' (the forces of the long run), {one_each}",
+        )
+    return None
+
+
 def _given(name: str) -> Callable[[Case], Verdict]:
     """The rule of an effect that is on wherever the material gives what it reads."""
 
@@ -266,6 +316,8 @@ class EffectOptions:
             cross-sections, of a `SectionMaterial`; see `Options`.
         relaxation: the force relaxes in time: `uniform`, all parts alike; `parts`, local contact
             and skeleton apart; see `Options`.
+        tools: `coupled`: the forces of all tools move each of them; `apart`: each force is that of
+            its tool alone, and the skeleton moves under all of them; `one`: one tool.
         want_surface: deformed vertices are asked for.
         want_joints: joints and their loads are asked for.
         want_ring_ends: ends of the rings are asked for.
@@ -320,6 +372,7 @@ class EffectOptions:
         _relaxation, field="options.relaxation", values={}, material=(RELAXES,),
         rungs=("off", "uniform", "parts"),
     )  # fmt: skip
+    tools: Literal["auto", "one", "apart", "coupled"] = _effect(_tools, least="", values={})
     want_surface: bool = True
     want_joints: bool = True
     want_ring_ends: bool = True

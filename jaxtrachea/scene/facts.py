@@ -1,6 +1,7 @@
 """The facts of a scene and its path, that its plan is made from (concrete numbers)."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -100,6 +101,22 @@ def facts_of(
         timed=path.time is not None,
         duration=0.0 if path.time is None else float(np.ptp(np.asarray(path.time, float))),
     )  # fmt: skip
+
+
+def facts_together(each: Sequence[SceneFacts]) -> SceneFacts:
+    """What the rules need to know of several tools of one scene: what one of them needs."""
+
+    def joined(name: str):
+        values = [getattr(facts, name) for facts in each]
+        if isinstance(values[0], tuple):
+            low, high = zip(*values, strict=True)
+            return min(low), max(high)
+        return max(values)
+
+    whole = "angle", "several_points", "along", "across", "slip", "friction", "near"
+    whole += "way_fixed", "way_per_step", "duration"
+    changed = {name: joined(name) for name in whole}
+    return dataclasses.replace(each[0], tools=len(each), **changed)
 
 
 def _largest(v) -> float:

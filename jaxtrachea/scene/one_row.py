@@ -19,6 +19,7 @@ from jaxtrachea._packed import Packing
 from jaxtrachea.fusion import fuse
 from jaxtrachea.scene.simulation import Simulation, surface
 from jaxtrachea.scene.stage import Scene
+from jaxtrachea.scene.together import deform_together
 
 #: Arrays of the result that have a number for every ring or vertex.
 LARGE = ("joints", "loads", "end_U", "end_V", "vertices")
@@ -73,7 +74,8 @@ class Row:
             return state, self.contacts.pack(contact), tuple(large.values()), press
 
         state, contact, large, press = fuse(line)(state, *given)
-        vertices = surface(self._setting(*given)[0], *press) if self._shown else None
+        lay = deform_together if self._scene.instruments else surface
+        vertices = lay(self._setting(*given)[0], *press) if self._shown else None
         return state, contact, large if vertices is None else (*large, vertices[0])
 
     def __call__(self, state, *given) -> tuple[Array, Simulation]:

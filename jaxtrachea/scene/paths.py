@@ -30,8 +30,8 @@ MESHES = {
 
 def path_of(
     spec: SceneSpec, folder: Path, files: list[Path], geometry: Geometry
-) -> Poses | Presses:
-    """The path of a scene.
+) -> Poses | Presses | dict[str, Poses | Presses]:
+    """The path of a scene; of several tools by name: legs of one tool follow one another.
 
     Args:
         spec: the scene.
@@ -42,38 +42,53 @@ def path_of(
     Raises:
         SpecError: a file or a value that cannot be used, with its key.
     """
+    legs, given = dict(enumerate(spec.path)), (spec, folder, files, geometry)
+    if not spec.names:
+        return _path(legs, *given)
+    return {
+        name: _path({i: leg for i, leg in legs.items() if leg.tool == name}, *given)
+        for name in spec.names
+    }
+
+
+def _path(
+    legs: dict[int, PathSection], spec: SceneSpec, folder: Path, files: list[Path],
+    geometry: Geometry,
+) -> Poses | Presses:  # fmt: skip
+    """The path of one tool; its legs by their place in the file."""
     if spec.path[0].kind == "press":
         reach = 0.0 if spec.effects.width == "point" else spec.model.half_width
-        return _presses(spec.path, geometry, reach)
-    legs = [_leg(leg, i, folder, files) for i, leg in enumerate(spec.path)]
-    *found, own = zip(*legs, strict=True)
+        return _presses(legs, geometry, reach)
+    *found, own = zip(*(_leg(leg, i, folder, files) for i, leg in legs.items()), strict=True)
     translation, vectors = (np.concatenate(v) for v in found)
     turn = jax.vmap(lambda v: pose_from_vector(v, jnp.zeros_like(v)).rotation)
-    time = _times(spec.path, [len(v) for v in found[0]], own)
+    time = _times(legs, [len(v) for v in found[0]], own)
     return Poses(turn(jnp.asarray(vectors)), jnp.asarray(translation), time)
 
 
 def _times(
-    legs: list[PathSection], rows: list[int], own: Sequence[np.ndarray | None]
+    legs: dict[int, PathSection], rows: list[int], own: Sequence[np.ndarray | None]
 ) -> np.ndarray | None:
     """Time of every row, s; None: no leg has any.
 
     Args:
-        legs: -
+        legs: by their place in the file.
         rows: of each leg.
         own: times that a file gives, from the end of the leg before on.
 
     Raises:
         SpecError: a leg without a time beside others that have one, or with two.
     """
-    timed = [leg.duration is not None or t is not None for leg, t in zip(legs, own, strict=True)]
+    timed = [
+        leg.duration is not None or t is not None for leg, t in zip(legs.values(), own, strict=True)
+    ]
     if not any(timed):
         return None
     if not all(timed):
-        i, other = timed.index(False), timed.index(True)
+        i, other = ([*legs][timed.index(word)] for word in (False, True))
         raise SpecError(f"path.{i}: no duration; expected one, as path.{other} has its time")
     found, end = [], 0.0
-    for i, (leg, count, t) in enumerate(zip(legs, rows, own, strict=True)):
+    for (i, leg), count, t in zip(legs.items(), rows, own, strict=True):
         if t is not None and leg.duration is not None:
             raise SpecError(f"path.{i}.duration: its file has a column 't'; remove one of them")
         if t is None:
@@ -85,13 +100,14 @@ def _times(
     return np.concatenate(found)
 
 
-def _presses(legs: list[PathSection], geometry: Geometry, reach: float) -> Presses:
+def _presses(legs: dict[int, PathSection], geometry: Geometry, reach: float) -> Presses:
     """Presses at places where all of the tool, which reaches so far along s, lies on the tube."""
     s, phi, D = [], [], []
     length, alpha = float(geometry.length), float(geometry.half_angle)
     low = reach if reach <= length / 2 else 0.0  # a wider one is refused as such
     width = f", where all of the tool (model.half_width {reach:g} mm) lies on it" if low else ""
-    for i, leg in enumerate(legs):
+    before = None
+    for i, leg in legs.items():
         at, angle, steps = leg.s or 0.0, leg.phi or 0.0, leg.steps or STEPS
         if not low <= at <= length - low:
             raise SpecError(
@@ -110,9 +126,11 @@ def _presses(legs: list[PathSection], geometry: Geometry, reach: float) -> Press
             D += [whole * (k + 1) / steps for k in range(steps)]
         else:
             _check_steps(steps, i)
-            same = i > 0 and (leg.s, leg.phi) == (legs[i - 1].s, legs[i - 1].phi)
+            same = before is not None and (leg.s, leg.phi) == (before.s, before.phi)
             D += list(np.linspace(D[-1] if same else 0 * whole, whole, steps))
-    time = _times(legs, [leg.steps or STEPS for leg in legs], [None] * len(legs))
+        before = leg
+    rows = [leg.steps or STEPS for leg in legs.values()]
+    time = _times(legs, rows, [None] * len(legs))
     return Presses(np.array(s), np.array(phi), np.array(D), time)
 
 

@@ -74,6 +74,7 @@ class Plan:
         joints: they are in the result.
         ring_ends: they are in the result.
         options: of the model.
+        tools: see `EffectOptions`.
         ignored: effects that stay off (the contact point: that stays) whatever a path needs,
             because the user wished it or a tolerance allows it. A row that needs any other effect
             that is off is refused by status (`ranges.outside_plan`).
@@ -94,6 +95,7 @@ class Plan:
     joints: bool
     ring_ends: bool
     options: Options
+    tools: Literal["one", "apart", "coupled"] = "one"
     ignored: frozenset[str] = frozenset()
     valid_range: ValidRange | None = None
     effects: tuple[Decision, ...] = dataclasses.field(default=(), compare=False, repr=False)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -67,6 +68,31 @@ def draw_series(scene: Scene, path: Poses | Presses, out: Simulation) -> Figure:
     return figure
 
 
+def draw_tools(names: list[str], out: Simulation) -> Figure:
+    """Normal force, local indentation and motion of the skeleton of several tools, row by row."""
+    figure = Figure(figsize=(9.6, 2.9), dpi=110, layout="constrained")
+    row, status = np.arange(len(out.s)) + 1, np.asarray(out.status)
+    inward = -np.stack([0 * out.phi, np.cos(out.phi), np.sin(out.phi)], axis=-1)
+    shown = {"normal force [N]": out.force, "indentation [mm]": out.depth,
+             "skeleton inwards [mm]": out.skeleton}  # fmt: skip
+    styles = ("-", "--", "-.", ":")
+    for axis, (label, value) in zip(figure.subplots(1, 3), shown.items(), strict=True):
+        along = np.sum(np.asarray(value, float) * inward, axis=-1)
+        for j, name in enumerate(names):
+            axis.plot(row, along[:, j], ls=styles[j % 4], lw=1.1, label=name, color=f"C{j % 10}")
+            if label.startswith("normal"):
+                _draw_status(axis, row, along[:, j], status[:, j], counted=False)
+        axis.set(xlabel="row", ylabel=label)
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.margins(y=0.08)
+        low, high = axis.get_ylim()
+        axis.set_ylim(low, high + 0.4 * (high - low))  # room for the legend
+        handles = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
+        axis.legend(handles.values(), handles, frameon=False, fontsize=7, loc="upper left")
+        axis.grid(alpha=0.25)
+    return figure
+
+
 def _way(path: Poses | Presses, out: Simulation) -> tuple[np.ndarray, str]:
     """What rows are drawn along, mm, and its name."""
     if isinstance(path, Presses):
@@ -99,8 +125,10 @@ def _draw_parts(axis: Any, way: np.ndarray, parts: dict[str, np.ndarray], colour
         axis.plot(way, value, color=colour or own, ls=style, marker=shown, ms=3, lw=1, label=name)
 
 
-def _draw_status(axis: Any, way: np.ndarray, force: np.ndarray, status: np.ndarray) -> None:
-    """A mark for every row by its status, named in the legend."""
+def _draw_status(
+    axis: Any, way: np.ndarray, force: np.ndarray, status: np.ndarray, counted: bool = True
+) -> None:
+    """A mark for every row by its status, named in the legend, with the number of rows."""
     for code in np.unique(status):
         which = PressStatus(int(code))
         solved = status == code
@@ -108,7 +136,8 @@ def _draw_status(axis: Any, way: np.ndarray, force: np.ndarray, status: np.ndarr
         height = force[solved] if which.solved else np.zeros(solved.sum())
         axis.scatter(
             way[solved], np.nan_to_num(height), marker=mark, s=16, linewidths=0.9,
-            zorder=3, label=f"{which.name.lower().replace('_', ' ')} ({solved.sum()} rows)",
+            zorder=3, label=which.name.lower().replace("_", " ")
+            + (f" ({solved.sum()} rows)" if counted else ""),
             **({"color": edge} if mark == "x" else {"facecolors": face, "edgecolors": edge}),
         )  # fmt: skip
 

@@ -27,8 +27,9 @@ class StoredSimulation(NamedTuple):
         plan: a row of each effect: its name, level, `forced` or `auto`, share of the operations
             ("": not computed) and reason.
         provenance: versions, digests of the inputs and times, as in provenance.json.
-        tool: its shape about its own origin, mm; None: presses at given points.
-        path: positions of the tool; None: presses at given points.
+        tool: its shape about its own origin, mm; None: presses at given points. Of several tools
+            by name, in the order of the series' axis of tools.
+        path: positions of the tool, or of each; None: presses at given points.
         material: values by name, in the units of docs/reference.md.
         rings: position, height and radius, mm, and half_angle, rad.
         rest: vertices, faces, s, phi and distance of the surface at rest, mm and rad; None: the
@@ -39,8 +40,8 @@ class StoredSimulation(NamedTuple):
     units: dict[str, str]
     plan: list[list[str]]
     provenance: dict
-    tool: Shape | None
-    path: Poses | None
+    tool: Shape | dict[str, Shape | None] | None
+    path: Poses | dict[str, Poses | None] | None
     material: dict[str, np.ndarray]
     rings: dict[str, np.ndarray]
     rest: dict[str, np.ndarray] | None
@@ -86,19 +87,19 @@ def read_simulation(path: Path | str) -> StoredSimulation:
 def _read(file) -> StoredSimulation:
     groups = {
         name: {key: np.asarray(data) for key, data in file[name].items()}
-        for name in ("series", "tool", "material", "rings", "rest")
+        for name in ("series", "material", "rings", "rest")
         if name in file
     }
     series = {name: groups["series"].get(name) for name in Simulation._fields}
     must = {"s", "phi", "displacement", "force", "depth", "skeleton", "depth_share", "status"}
     if missing := sorted(name for name in must if series[name] is None):
         raise KeyError(f"no series {', '.join(missing)}")
-    shape = path = None
-    if tool := groups.get("tool"):
-        path = Poses(tool["rotation"], tool["translation"], groups["series"].get("time"))
-        if "radius" in tool:
-            names = [name for name in ("vertices", "radius", "counts") if name in tool]
-            shape = Shape(**{name: jnp.asarray(tool[name]) for name in names})
+    if (names := json.loads(file.attrs.get("tools", "null"))) is not None:
+        found = {name: _tool(file, f"tool/{i}") for i, name in enumerate(names)}
+        shape = {name: own for name, (own, _) in found.items()}
+        path = {name: own for name, (_, own) in found.items()}
+    else:
+        shape, path = _tool(file, "tool")
     return StoredSimulation(
         simulation=Simulation(**series),  # pyright: ignore
         units={n: file["series"][n].attrs["units"] for n, v in series.items() if v is not None},
@@ -110,3 +111,16 @@ def _read(file) -> StoredSimulation:
         rings=groups["rings"],
         rest=groups.get("rest"),
     )
+
+
+def _tool(file, group: str) -> tuple[Shape | None, Poses | None]:
+    """Shape and positions of a tool; None: presses at given points."""
+    if group not in file:
+        return None, None
+    tool = {key: np.asarray(data) for key, data in file[group].items()}
+    time = file["series"].get("time")
+    path = Poses(tool["rotation"], tool["translation"], None if time is None else np.asarray(time))
+    if "radius" not in tool:
+        return None, path
+    names = [name for name in ("vertices", "radius", "counts") if name in tool]
+    return Shape(**{name: jnp.asarray(tool[name]) for name in names}), path

@@ -1,6 +1,7 @@
 """Files of a simulation: HDF5 with units, deformed meshes as PLY and GLB."""
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import h5py
@@ -10,8 +11,9 @@ from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.files.table import Table
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES
+from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.plan import Plan
-from jaxtrachea.scene.simulation import Simulation
+from jaxtrachea.scene.simulation import OF_TOOLS, Simulation, of_tool
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.scene.sweep import Sweep
 from jaxtrachea.status import PressStatus
@@ -40,11 +42,14 @@ def write_simulation(
     path: Path,
     scene: Scene,
     material: AnyMaterial,
-    motion: Poses | Presses,
+    motion: Poses | Presses | Mapping[str, Poses | Presses],
     out: Simulation,
     provenance: dict,
 ) -> None:
-    """All series of a simulation; one dataset each, its unit as attribute (docs/simulate.md)."""
+    """All series of a simulation; one dataset each, its unit as attribute (docs/simulate.md).
+
+    Of several tools the group `tool` has a group for each, in their order, with its name.
+    """
     with hdf5_file(path) as file:
         _head(file, provenance, scene.plan)
         series = file.create_group("series")
@@ -52,17 +57,15 @@ def write_simulation(
             if value is not None:
                 data = series.create_dataset(name, data=np.asarray(value), compression="gzip")
                 data.attrs["units"] = UNITS.get(name, "mm")
-                _name_dimensions(series, data)
+                _name_dimensions(series, data, bool(scene.instruments) and name in OF_TOOLS)
         series["status"].attrs["meaning"] = json.dumps({int(s): s.message for s in PressStatus})
-        if isinstance(motion, Poses):
-            tool = file.create_group("tool")
-            tool.create_dataset("translation", data=motion.translation).attrs["units"] = "mm"
-            tool.create_dataset("rotation", data=motion.rotation).attrs["units"] = "1"
-            if scene.tool is not None:
-                tool.create_dataset("vertices", data=scene.tool.vertices).attrs["units"] = "mm"
-                tool.create_dataset("radius", data=scene.tool.radius).attrs["units"] = "mm"
-                if scene.tool.counts is not None:
-                    tool.create_dataset("counts", data=scene.tool.counts).attrs["units"] = "1"
+        if isinstance(motion, Mapping):
+            file.attrs["tools"] = json.dumps(scene.names)
+            for i, instrument in enumerate(scene.instruments):
+                own = motion[instrument.name]
+                _write_tool(file, f"tool/{i}", scene_of(scene, instrument), own)
+        else:
+            _write_tool(file, "tool", scene, motion)
         _write_rings(file.create_group("rings"), scene)
         _write_material(file.create_group("material"), material)
         if scene.mesh is not None:
@@ -72,11 +75,28 @@ def write_simulation(
                 data.attrs["units"] = {"faces": "1", "phi": "rad"}.get(name, "mm")
 
 
-def _name_dimensions(series: h5py.Group, data: h5py.Dataset) -> None:
+def _write_tool(file: h5py.File, name: str, scene: Scene, motion: Poses | Presses) -> None:
+    """Where a tool stands in each row, and its shape; nothing of presses at points."""
+    if not isinstance(motion, Poses):
+        return
+    tool = file.create_group(name)
+    tool.create_dataset("translation", data=motion.translation).attrs["units"] = "mm"
+    tool.create_dataset("rotation", data=motion.rotation).attrs["units"] = "1"
+    if scene.tool is not None:
+        tool.create_dataset("vertices", data=scene.tool.vertices).attrs["units"] = "mm"
+        tool.create_dataset("radius", data=scene.tool.radius).attrs["units"] = "mm"
+        if scene.tool.counts is not None:
+            tool.create_dataset("counts", data=scene.tool.counts).attrs["units"] = "1"
+
+
+def _name_dimensions(series: h5py.Group, data: h5py.Dataset, of_tools: bool) -> None:
     """Dimension scales as netCDF-4 has them, without values: xarray reads the names."""
     middle = "vertex" if data.name == "/series/vertices" else "ring"
+    before = ("row", "tool") if of_tools else ("row",)
     if data.name in ("/series/frame", "/series/stiffness"):
-        names = "row", "xyz", "column"
+        names = *before, "xyz", "column"
+    elif of_tools:
+        names = *before, "xyz"
     else:
         names = ("row", "xyz") if data.ndim == 2 else ("row", middle, "xyz")
     for axis, (name, size) in enumerate(zip(names, data.shape, strict=False)):
@@ -104,8 +124,21 @@ def _write_material(group: h5py.Group, material: AnyMaterial) -> None:
             group.create_dataset(name, data=value).attrs["units"] = declared[name].unit
 
 
-def write_forces(path: Path, out: Simulation) -> None:
-    """A row of numbers for each row of a simulation, as CSV (docs/simulate.md)."""
+def write_forces(path: Path, out: Simulation, tools: Sequence[str] = ()) -> None:
+    """A row of numbers for each row of a simulation, as CSV (docs/simulate.md).
+
+    Of several tools, with their names, a row for each of them.
+    """
+    if not tools:
+        rows = _force_rows(out)
+    else:
+        each = [_force_rows(of_tool(out, i), name) for i, name in enumerate(tools)]
+        rows = [row for of_all in zip(*each, strict=True) for row in of_all]
+    Table(rows).write_csv(path)
+
+
+def _force_rows(out: Simulation, tool: str = "") -> list[dict]:
+    """The rows of `write_forces` of one tool."""
     names = {"time": ("time_s",), "s": ("s_mm",), "phi": ("phi_rad",), "gap": ("gap_mm",)}
     names |= {
         name: tuple(f"{name}_{axis}_{unit}" for axis in "xyz")
@@ -118,11 +151,12 @@ def write_forces(path: Path, out: Simulation) -> None:
             parts = np.asarray(value, float).reshape(len(out.status), -1).T
             columns |= dict(zip(heads, parts, strict=True))
     columns["depth_share"] = np.asarray(out.depth_share, float)
-    rows = [
-        {"row": i + 1, **{head: float(v[i]) for head, v in columns.items()}, "status": word}
-        for i, word in enumerate(PressStatus(int(v)).name for v in np.asarray(out.status))
-    ]
-    Table(rows).write_csv(path)
+    rows = []
+    for i, status in enumerate(np.asarray(out.status)):
+        numbers = {head: float(v[i]) for head, v in columns.items()}
+        named = {"row": i + 1} | ({"tool": tool} if tool else {})
+        rows.append(named | numbers | {"status": PressStatus(int(status)).name})
+    return rows
 
 
 def write_sweep(path: Path, scene: Scene, s, phi, depth: float, out: Sweep, made: dict) -> None:
@@ -162,5 +196,6 @@ def write_meshes(folder: Path, scene: Scene, out: Simulation) -> None:
 
 def last_solved(out: Simulation) -> int | None:
     """The last row that is finite."""
-    good = np.flatnonzero(np.isfinite(np.asarray(out.force)).all(axis=1))
+    known = np.isfinite(np.asarray(out.force)).reshape(len(out.force), -1)
+    good = np.flatnonzero(known.all(axis=1))
     return int(good[-1]) if len(good) else None

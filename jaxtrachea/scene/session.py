@@ -8,6 +8,8 @@ array each (`one_row`).
 import dataclasses
 import threading
 import time
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +25,7 @@ from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.validation import check_alike
 from jaxtrachea.scene.assemble import with_tool
-from jaxtrachea.scene.held_force import HeldForce, held_force, next_force, no_force
+from jaxtrachea.scene.held_force import HeldForce, LastForce, held_force, next_force, no_force
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Scene, check_kind, check_material
@@ -111,10 +113,13 @@ class Session:
         if keep < 1:
             raise ValueError(f"keep is {keep}; expected at least 1")
         check_scene(scene, material)
+        if stiffness and scene.instruments:
+            raise ValueError("stiffness is of one tool; expected stiffness=False for several")
         self.scene, self.material, self._stiffness = scene, material, stiffness
         self.dtype = np.dtype(scene.footprint.dtype)
         self._seconds, self._steps = np.zeros(keep), 0
-        self._last_force = no_force(self.dtype)
+        self._last_force = self._no_force()
+        self._stands = self._nowhere()
         self._lock = threading.Lock()
         self._compile()
 
@@ -129,19 +134,38 @@ class Session:
         self._start = row.states.fill(state)
         pose = np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype)
         pose += (np.zeros((), self.dtype),) if self._timed else ()
+        pose = self._nowhere() if self.scene.instruments else pose
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
 
+    def _no_force(self) -> LastForce:
+        return no_force(self.dtype, len(self.scene.instruments))
+
+    def _nowhere(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rotations and translations of several tools, and which are there: none yet."""
+        count = len(self.scene.instruments)
+        turn = np.tile(np.eye(3, dtype=self.dtype), (count, 1, 1))
+        return turn, np.zeros((count, 3), self.dtype), np.zeros(count, bool)
+
     def step(
-        self, rotation: ArrayLike, translation: ArrayLike, dt: ArrayLike | None = None
+        self,
+        rotation: ArrayLike | Mapping[str, tuple[ArrayLike, ArrayLike]],
+        translation: ArrayLike | None = None,
+        dt: ArrayLike | None = None,
+        *,
+        present: Mapping[str, bool] = MappingProxyType({}),
     ) -> Simulation:
-        """Move the tool.
+        """Move the tool, or several.
 
         Args:
-            rotation: of the tool, orthogonal with determinant 1; shape (3, 3).
+            rotation: of the tool, orthogonal with determinant 1; shape (3, 3). Of a scene of
+                several tools a mapping of names to (rotation, translation): a tool that is left
+                out stays where it was; one that has had no pose yet is not there.
             translation: of its origin, mm; shape (3,).
             dt: time since the step before, s; a force that relaxes needs it, nothing else reads it.
                 One that is negative or no number gives a row of NaN with BACK_IN_TIME and changes
                 nothing else.
+            present: of several tools: False lifts one off the wall, until it is given a pose again
+                or True.
 
         Returns:
             Fields as those of `simulate`, without the axis of rows, finished: numpy arrays; but
@@ -150,9 +174,13 @@ class Session:
 
         Raises:
             ValueError: another shape, or a matrix that is no rotation; no dt where the force
-                relaxes, or one that is not one number; the state stays as it was.
+                relaxes, or one that is not one number; a tool that the scene has not, a mapping
+                where it has one tool, or one pose where it has several; the state stays as it was.
         """
         begin = time.perf_counter()
+        if self.scene.instruments or isinstance(rotation, Mapping) or present:
+            stands = self._moved(rotation, translation, present)
+            return self._run(begin, stands, stands)
         turn, place = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
         if turn.shape != (3, 3) or place.shape != (3,):
             raise ValueError(
@@ -167,9 +195,54 @@ class Session:
             if not isinstance(dt, float) and (np.ndim(dt) or isinstance(dt, str)):
                 raise ValueError(f"dt is {dt!r}; expected one number, s, as in 0.001")
             pose = turn, place, np.asarray(dt, self.dtype)
+        return self._run(begin, pose)
+
+    def _moved(self, poses: Any, translation: Any, present: Mapping[str, bool]):
+        """Where several tools stand now: rotations, translations, whether they are there.
+
+        Raises:
+            ValueError: see `step`.
+        """
+        names = self.scene.names
+        if not names:
+            raise ValueError(
+                "poses by name, and the scene has one tool without a name; expected rotation and "
+                "translation, or a scene made with a mapping of paths"
+            )
+        if not isinstance(poses, Mapping) or translation is not None:
+            raise ValueError(
+                f"one pose, and the scene has the tools {', '.join(map(repr, names))}; expected a "
+                "mapping of names to (rotation, translation)"
+            )
+        if unknown := [name for name in (*poses, *present) if name not in names]:
+            raise ValueError(
+                f"there is no tool {unknown[0]!r}; expected {', '.join(map(repr, names))}"
+            )
+        turns, places, there = (v.copy() for v in self._stands)
+        for name, pose in poses.items():
+            if not isinstance(pose, tuple | list) or len(pose) != 2:
+                raise ValueError(f"pose of {name!r}: expected (rotation, translation)")
+            turn, place = (np.asarray(v, self.dtype) for v in pose)
+            if turn.shape != (3, 3) or place.shape != (3,):
+                raise ValueError(
+                    f"{name!r}: rotation {turn.shape}, translation {place.shape}; expected (3, 3) "
+                    "and (3,)"
+                )
+            if not is_rotation(turn):
+                check_rotations(f"rotation of {name!r}", turn[None])
+            i = names.index(name)
+            turns[i], places[i], there[i] = turn, place, True
+        for name, is_there in present.items():
+            there[names.index(name)] = is_there
+        return turns, places, there
+
+    def _run(self, begin: float, pose: tuple, stands: Any = None) -> Simulation:
+        """A step of the program."""
         with self._lock:
             # Two arrays: to make one of them takes longer than it saves.
             result = self._program(*pose, self._numbers)
+            if stands is not None:
+                self._stands = stands
             self._last_force = next_force(self._last_force, result)
             self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
             self._steps += 1
@@ -194,7 +267,7 @@ class Session:
         own = dataclasses.replace(state, origin=self._states.like.origin)
         with self._lock:
             self._program.state = jnp.array(self._states.fill(own))
-            self._last_force = no_force(self.dtype)
+            self._last_force = self._no_force()
 
     def __deepcopy__(self, memo: dict) -> "Session":
         """One that goes on from the same state by the same program."""
@@ -213,6 +286,7 @@ class Session:
     def __getstate__(self) -> dict[str, Any]:
         """All but the program, which is compiled anew."""
         names = "scene", "material", "dtype", "_stiffness", "_seconds", "_steps", "_last_force"
+        names += ("_stands",)
         with self._lock:
             kept = {name: getattr(self, name) for name in names}
             return kept | {"numbers": np.array(self._program.state)}
@@ -272,6 +346,8 @@ class Session:
             ValueError: another number of corners or another dtype, or a size that the program does
                 not reach (or no tool has).
         """
+        if self.scene.instruments:
+            raise ValueError("a session of several tools keeps its tools; make a new Session")
         scene = with_tool(self.scene, tool)
         with self._lock:
             self._change(scene, self.material)
@@ -286,7 +362,7 @@ class Session:
 
     def _begin_anew(self) -> None:
         self._program.state = jnp.array(self._start)
-        self._last_force = no_force(self.dtype)
+        self._last_force, self._stands = self._no_force(), self._nowhere()
 
     def reset(self) -> None:
         """Forget where the tool was, the force that was held, and all latencies."""

@@ -4,7 +4,7 @@ The program is put together from the scene's static `Plan`; what is off is not i
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,9 +19,10 @@ from jaxtrachea.mechanics.press_history import History, Samples, at_rest
 from jaxtrachea.mechanics.press_in_time import validated
 from jaxtrachea.mechanics.samples import in_order
 from jaxtrachea.relaxation.filter import Relaxation
-from jaxtrachea.scene.approach import Approach, approach
+from jaxtrachea.scene.approach import Approach, approach, approach_together
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
+from jaxtrachea.scene.instruments import paths_in_order, scene_of
 from jaxtrachea.scene.programs import Moved, move
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import (
@@ -32,8 +33,20 @@ from jaxtrachea.scene.refusals import (
     status_of,
     without_negative_values,
 )
-from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
+from jaxtrachea.scene.stage import (
+    Poses,
+    Presses,
+    Scene,
+    check_kind,
+    check_material,
+    check_path,
+)
+from jaxtrachea.scene.together import deform_together, press_together
 from jaxtrachea.status import PressStatus
+
+#: Fields of a `Simulation` that there is one of for each tool.
+OF_TOOLS = ("s", "phi", "gap", "displacement", "force", "moment", "depth", "skeleton", "slip",
+            "dissipated", "frame", "depth_share", "contact_share", "status")  # fmt: skip
 
 
 class Simulation(NamedTuple):
@@ -77,30 +90,32 @@ class Simulation(NamedTuple):
             both in the frame of the poses; shape (rows, 3, 3). Of `step` alone, on request.
     """
 
-    s: Float[Array, " rows"]
-    phi: Float[Array, " rows"]
-    gap: Float[Array, " rows"] | None
-    displacement: Float[Array, "rows 3"]
-    force: Float[Array, "rows 3"]
-    moment: Float[Array, "rows 3"] | None
-    depth: Float[Array, "rows 3"]
-    skeleton: Float[Array, "rows 3"]
+    s: Float[Array, " rows *tools"]
+    phi: Float[Array, " rows *tools"]
+    gap: Float[Array, " rows *tools"] | None
+    displacement: Float[Array, "rows *tools 3"]
+    force: Float[Array, "rows *tools 3"]
+    moment: Float[Array, "rows *tools 3"] | None
+    depth: Float[Array, "rows *tools 3"]
+    skeleton: Float[Array, "rows *tools 3"]
     joints: Float[Array, "rows rings 3"] | None
     loads: Float[Array, "rows rings 3"] | None
     end_U: Float[Array, "rows rings 3"] | None
     end_V: Float[Array, "rows rings 3"] | None
-    slip: Float[Array, "rows 3"] | None
-    dissipated: Float[Array, " rows"] | None
-    frame: Float[Array, "rows 3 3"] | None
+    slip: Float[Array, "rows *tools 3"] | None
+    dissipated: Float[Array, " rows *tools"] | None
+    frame: Float[Array, "rows *tools 3 3"] | None
     vertices: Float[Array, "rows vertices 3"] | None
-    depth_share: Float[Array, " rows"]
-    contact_share: Float[Array, " rows"] | None
-    status: Int[Array, " rows"]
+    depth_share: Float[Array, " rows *tools"]
+    contact_share: Float[Array, " rows *tools"] | None
+    status: Int[Array, " rows *tools"]
     time: Float[Array, " rows"] | None = None
     stiffness: Float[Array, "rows 3 3"] | None = None
 
 
-def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
+def simulate(
+    scene: Scene, material: AnyMaterial, path: Poses | Presses | Mapping[str, Poses | Presses]
+) -> Simulation:
     """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
 
     The rows of a path with `contact_point` fixed belong together: the tool stays on the place that
@@ -120,21 +135,65 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
         scene: from `make_scene`, or put together by hand.
         material: as the plan needs it; a `SectionMaterial` for a skeleton `sections`, and a
             `RelaxingMaterial` for a force that relaxes.
-        path: `Poses` if the plan has contact, else `Presses`.
+        path: `Poses` if the plan has contact, else `Presses`; of a scene that was made with a
+            mapping a mapping of the same tools. They move side by side; a shorter path rests at its
+            last row. A row in which one tool is refused has no numbers for any.
 
     Raises:
         ValueError: the other kind of path, arrays of a wrong length, something missing that the
-            plan needs, or (outside of `jit`) matrices of the path that are no rotations; no scene.
+            plan needs, or (outside of `jit`) matrices of the path that are no rotations; no scene;
+            other tools than the scene has, or times of theirs that do not agree.
     """
     check_word("scene", scene, Scene)
-    plan = scene.plan
-    check_path(path)
+    named = isinstance(path, Mapping)
+    if named != bool(scene.instruments):
+        names = ", ".join(map(repr, scene.names))
+        expected = f"a mapping of the tools {names}" if names else "Poses or Presses"
+        raise ValueError(f"path is {type(path).__name__}; expected {expected}, as the scene has")
+    if isinstance(path, Mapping):
+        paths = paths_in_order(scene.names, path)
+    else:
+        check_path(path)
+        paths = (path,)
     check_material(scene.geometry, material)
     check_kind(scene, material)
-    if plan.contact != isinstance(path, Poses):
+    if scene.plan.contact != isinstance(paths[0], Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
-        raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
-    return _simulate(scene, material, path)
+        found, expected = type(paths[0]).__name__, kinds[not scene.plan.contact]
+        raise ValueError(f"path is {found}; expected {expected}")
+    return _of_tools(scene, material, paths) if named else _simulate(scene, material, paths[0])
+
+
+@functools.partial(jax.jit, inline=True)
+def _of_tools(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Presses]) -> Simulation:
+    """`simulate`, of arguments that are checked, for the tools of a mapping."""
+    if scene.plan.tools == "one":
+        alone = _simulate(scene_of(scene, scene.instruments[0]), material, paths[0])
+        return with_axis(alone)
+    made: list[Approach | None] = [None] * len(paths)
+    if poses := [path for path in paths if isinstance(path, Poses)]:
+        made = [*approach_together(scene, poses)]
+    found, moved = press_together(scene, long_run(material), paths, made)
+    vertices = deform_together(scene, moved)
+    return as_simulation(found)._replace(vertices=vertices, time=paths[0].time)
+
+
+def as_simulation(found: dict[str, Any]) -> Simulation:
+    """The result of `press_together`; None what is not in it."""
+    none: dict[str, Any] = dict.fromkeys(Simulation._fields)
+    return Simulation(**none | found)
+
+
+def of_tool(result: Simulation, tool: int) -> Simulation:
+    """Of a result for several tools that of one, without their axis."""
+    fields = {name: getattr(result, name) for name in OF_TOOLS}
+    return result._replace(**{n: v[:, tool] for n, v in fields.items() if v is not None})
+
+
+def with_axis(alone: Simulation) -> Simulation:
+    """The result for one tool, with an axis of tools behind that of rows."""
+    fields = {name: getattr(alone, name) for name in OF_TOOLS}
+    return alone._replace(**{n: v[:, None] for n, v in fields.items() if v is not None})
 
 
 @functools.partial(jax.jit, inline=True)

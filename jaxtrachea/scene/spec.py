@@ -8,9 +8,11 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, create_model, model_validator
 
 from jaxtrachea.config import (
+    EVEN,
+    LISTED,
     Angle,
     Length,
     PositiveLength,
@@ -21,6 +23,7 @@ from jaxtrachea.config import (
     quantity,
 )
 from jaxtrachea.contact.shapes import MAX_PARTS
+from jaxtrachea.mechanics.press_contacts import MOST_CONTACTS
 from jaxtrachea.mechanics.sections.material import (
     LEAST,
     SECTION_VALUES,
@@ -256,8 +259,10 @@ class PartSection(ShapeSection):
 
 
 class ToolSection(ShapeSection):
-    """[tool]: one convex shape, or several parts that move together (forceps, a hook)."""
+    """[tool], or one of [[tool]]: a convex shape, or parts that move together (forceps, a hook)."""
 
+    name: str | None = Field(None, min_length=1, max_length=40)
+    """of each of several tools, `[[tool]]`"""
     parts: list[PartSection] | None = Field(None, min_length=1, max_length=MAX_PARTS)
     """convex parts that move together, in the place of a shape: the deepest touches"""
     friction: float | None = Field(None, ge=0, le=10)
@@ -289,6 +294,8 @@ PATHS = {
 class PathSection(Section):
     """[[path]]: a press at (s, phi) by a vector, a line of the tool, a list, or a CSV file."""
 
+    tool: str | None = None
+    """name of the one of several tools that it moves; all move side by side"""
     s: Length | None = None
     """press: contact position"""
     phi: Angle | None = None
@@ -315,12 +322,12 @@ class PathSection(Section):
     @property
     def kind(self) -> str:
         """One of `PATHS`."""
-        given = self.model_fields_set
+        given = self.model_fields_set - {"tool"}
         return next(kind for kind, (needed, _) in PATHS.items() if needed <= given)
 
     @model_validator(mode="after")
     def _one_kind(self) -> "PathSection":
-        given = self.model_fields_set
+        given = self.model_fields_set - {"tool"}
         for needed, allowed in PATHS.values():
             if needed <= given:
                 if given - needed - allowed:
@@ -436,6 +443,13 @@ class SweepSection(Section):
     """presses computed together"""
 
 
+#: `[tool]`, or several as `[[tool]]`.
+Tools = Annotated[
+    Annotated[ToolSection, Tag(EVEN)] | Annotated[list[ToolSection], Tag(LISTED)],
+    Discriminator(lambda value: LISTED if isinstance(value, list) else EVEN),
+]
+
+
 class SceneSpec(Section):
     """A whole scene."""
 
@@ -453,8 +467,8 @@ class SceneSpec(Section):
     """moduli that those follow from"""
     relaxation: RelaxationSection | None = None
     """how the force relaxes in time; the path needs times"""
-    tool: ToolSection | None = None
-    """the tool; presses need none"""
+    tool: Tools | None = None
+    """the tool; presses need none. Several: `[[tool]]`, each with a `name`"""
     path: list[PathSection] = Field(min_length=1)
     """what happens, in order"""
     model: LawSection = LawSection()
@@ -519,7 +533,64 @@ class SceneSpec(Section):
             raise ValueError("path: presses (s, displacement) and motions of the tool do not mix")
         if not any(presses) and self.tool is None:
             raise ValueError("path: a motion of the tool needs [tool]; or give s and displacement")
+        self._check_names()
+        if self.names and self.plan is not None:
+            raise ValueError("plan: a tolerance is for one tool; leave [plan] out")
+        if self.names and self.output.play:
+            raise ValueError("output.play: the page shows one tool; set play = false")
         return self
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the tools that have a path each; empty: one tool, or presses, without a name."""
+        if isinstance(self.tool, list):
+            return [tool.name or "" for tool in self.tool]
+        return list(dict.fromkeys(leg.tool for leg in self.path if leg.tool is not None))
+
+    def _check_names(self) -> None:
+        """Refuse tools and paths that do not belong to one another.
+
+        Raises:
+            ValueError: the key, what was found and what is expected.
+        """
+        many = self.tool if isinstance(self.tool, list) else []
+        if not isinstance(self.tool, list | None) and self.tool.name is not None:
+            raise ValueError("tool.name: of several tools alone; write [[tool]], or remove it")
+        names, seen = self.names, {}
+        if len(names) > MOST_CONTACTS:
+            raise ValueError(f"tool: {len(names)} tools; expected at most {MOST_CONTACTS}")
+        for i, tool in enumerate(many):
+            if tool.name is None:
+                raise ValueError(f"tool.{i}.name: missing; several tools have a name each")
+            if tool.name in seen:
+                raise ValueError(
+                    f"tool.{i}.name: {tool.name!r} is the name of tool.{seen[tool.name]}, too; "
+                    "give each its own"
+                )
+            seen[tool.name] = i
+        of_one = self.tool is not None and not many
+        for i, leg in enumerate(self.path):
+            if leg.tool is not None and of_one:
+                raise ValueError(f"path.{i}.tool: there is one [tool]; remove it, or use [[tool]]")
+            if leg.tool is None and names:
+                raise ValueError(
+                    f"path.{i}.tool: missing; name the tool that it moves: {_words(names)}"
+                )
+            if leg.tool is not None and leg.tool not in names:
+                raise ValueError(
+                    f"path.{i}.tool: there is no tool {leg.tool!r}; expected {_words(names)}"
+                )
+        moved = {leg.tool for leg in self.path}
+        for i, tool in enumerate(many):
+            if tool.name not in moved:
+                raise ValueError(
+                    f"tool.{i}: no path moves {tool.name!r}; give a [[path]] with "
+                    f"tool = {tool.name!r}, or remove the tool"
+                )
+
+
+def _words(names: list[str]) -> str:
+    return ", ".join(map(repr, names))
 
 
 def load_scene_spec(path: Path) -> SceneSpec:

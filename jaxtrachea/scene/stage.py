@@ -163,6 +163,26 @@ def check_path(path: Presses | Poses) -> None:
         shaped("path.time", path.time, (rows,), why=" (rows as the path has)")
 
 
+class Instrument(eqx.Module):
+    """One of several tools: what a `Scene` of this tool alone has of its own.
+
+    Attributes:
+        name: of the tool (static).
+        tool: see `Scene`, as all others.
+        friction: -
+        footprint: -
+        near: -
+        quality: -
+    """
+
+    name: str = eqx.field(static=True)
+    tool: Shape | None
+    friction: Float[Array, ""] | None
+    footprint: Float[Array, ""]
+    near: int = eqx.field(static=True)
+    quality: Settings = eqx.field(static=True)
+
+
 class Scene(eqx.Module):
     """Everything of a scene but its material and its path.
 
@@ -178,6 +198,8 @@ class Scene(eqx.Module):
         footprint: distance between the circles of the dent's centres, mm.
         runs: order of the mesh's vertices, for a dent of this footprint; or None.
         points: the vertices on the wall of deforming cross-sections, in the place of `binding`.
+        instruments: tools of a scene whose path is a mapping, in its order; tool and friction are
+            None then, and the footprint is the largest. Empty: one tool, or none.
         plan: the program (static).
         quality: accuracy and work of the search for a contact (static).
     """
@@ -195,6 +217,12 @@ class Scene(eqx.Module):
     quality: Settings = eqx.field(static=True, default=STANDARD)
     runs: local.Runs | None = None
     points: Points | None = None
+    instruments: tuple[Instrument, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the instruments."""
+        return [instrument.name for instrument in self.instruments]
 
 
 def touch_tube(scene: Scene, path: Poses) -> Touch:
@@ -207,11 +235,11 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     """
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
-    return _touch_rows(scene.tool, scene.tube, path, scene.quality, scene.near)
+    return touch_rows(scene.tool, scene.tube, path, scene.quality, scene.near)
 
 
 @partial(jax.jit, static_argnames=("quality", "near"), inline=True)
-def _touch_rows(tool: Shape, tube: Patches, path: Poses, quality: Settings, near: int) -> Touch:
+def touch_rows(tool: Shape, tube: Patches, path: Poses, quality: Settings, near: int) -> Touch:
     """`touch_tube`: of other plans of a scene too it is traced once."""
 
     def one(R, T):

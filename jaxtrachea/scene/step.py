@@ -28,13 +28,21 @@ from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.grip import Slip, pick
 from jaxtrachea.scene.hold import hold
+from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.one_row import Row
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.rub import no_slip
 from jaxtrachea.scene.simulation import Before, Pressed, Simulation, pressed
-from jaxtrachea.scene.stage import Poses, Scene, check_kind, check_material, touch_tube
+from jaxtrachea.scene.stage import (
+    Poses,
+    Scene,
+    check_kind,
+    check_material,
+    touch_tube,
+)
+from jaxtrachea.scene.step_together import States, move_tools
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.
@@ -79,8 +87,8 @@ class State(eqx.Module):
     origin: Origin = eqx.field(static=True)
 
 
-def init_state(scene: Scene, material: AnyMaterial) -> State:
-    """The state before the first step: the tool was nowhere.
+def init_state(scene: Scene, material: AnyMaterial) -> State | States:
+    """The state before the first step: the tool was nowhere; of several tools that of each.
 
     Args:
         scene: from `make_scene` with a path of `Poses`.
@@ -90,6 +98,9 @@ def init_state(scene: Scene, material: AnyMaterial) -> State:
         ValueError: as `Session`.
     """
     check_scene(scene, material)
+    if scene.instruments:
+        views = [scene_of(scene, instrument) for instrument in scene.instruments]
+        return States(tuple(_start(view, None) for view in views), origin_of(scene))
     state = _start(scene, _rest(scene, material))
     return dataclasses.replace(state, origin=origin_of(scene))
 
@@ -132,6 +143,10 @@ def step(
             rotation; a material that does not fit; no dt where the force relaxes. What is traced is
             checked by shape and dtype.
     """
+    if isinstance(scene, Scene) and scene.instruments:
+        raise ValueError(
+            "scene has several tools, and step moves one; use Session.step with a mapping of poses"
+        )
     check_scene(scene, material)
     check_state(scene, state)
     dtype = scene.footprint.dtype
@@ -171,7 +186,7 @@ def check_scene(scene: Scene, material: AnyMaterial) -> None:
         ValueError: see `Session`.
     """
     check_word("scene", scene, Scene)
-    if not scene.plan.contact or scene.tool is None:
+    if not scene.plan.contact or (scene.tool is None and not scene.instruments):
         raise ValueError("the plan has no contact; make the scene with a path of Poses")
     if not scene.plan.mechanics.stepwise:
         raise ValueError(
@@ -182,20 +197,20 @@ def check_scene(scene: Scene, material: AnyMaterial) -> None:
     check_material(scene.geometry, material)
 
 
-def check_state(scene: Scene, state: State) -> None:
+def check_state(scene: Scene, state: State | States) -> None:
     """Refuse what is no state of this scene.
 
     Raises:
         ValueError: another version, plan, dtype, or other arrays; or no state.
     """
-    check_word("state", state, State)
+    check_word("state", state, States if scene.instruments else State)
     version, plan, numbers = state.origin
     if version != STATE_VERSION:
         raise ValueError(f"state has version {version}; expected {STATE_VERSION}: begin anew")
     if plan != scene.plan:
         raise ValueError(f"state belongs to a scene of another plan: {_unlike(plan, scene.plan)}")
     dtype = scene.footprint.dtype
-    found = state.anchor.point.dtype
+    found = (state.tools[0] if isinstance(state, States) else state).anchor.point.dtype
     if found != dtype:
         raise ValueError(f"state is {found}; expected {dtype}, as the scene has")
     if numbers and digest_of(scene) not in ("", numbers):
@@ -274,18 +289,17 @@ class Changeable(NamedTuple):
 
     Attributes:
         material: -
-        tool: its shape about its own origin.
+        tool: its shape about its own origin; None: several, which stay.
         footprint: of the scene, which goes with the tool.
     """
 
     material: AnyMaterial
-    tool: Shape
+    tool: Shape | None
     footprint: Float[Array, ""]
 
 
 def changeable(scene: Scene, material: AnyMaterial) -> Changeable:
     """What may change, of this scene."""
-    assert scene.tool is not None
     return Changeable(material, scene.tool, scene.footprint)
 
 
@@ -299,7 +313,7 @@ class Numbers:
         states: layout of the state.
     """
 
-    def __init__(self, scene: Scene, given: Changeable, state: State, *, stiffness: bool):
+    def __init__(self, scene: Scene, given: Changeable, state: State | States, *, stiffness: bool):
         """Lay out what changes and the state, or others of their shapes."""
         self._scene, self._stiffness = scene, stiffness
         self.given, self.states = Packing(given, weak=scene.footprint.dtype), Packing(state)
@@ -314,6 +328,7 @@ class Numbers:
         """As `move_tool` (traced)."""
         scene, material = self.setting(*given)
         move = move_with_stiffness if self._stiffness else move_tool
+        move = move_tools if scene.instruments else move
         moved = move(scene, material, self.states.unpack(state), *given[:-1])
         return self.states.pack(moved[0]), *moved[1:]
 

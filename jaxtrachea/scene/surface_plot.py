@@ -6,6 +6,7 @@ everywhere. Triangles are painted from the farthest to the nearest.
 
 import dataclasses
 import textwrap
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,8 @@ from matplotlib.patches import Patch
 from scipy.spatial import QhullError
 
 from jaxtrachea.files.pictures import plain
-from jaxtrachea.scene.simulation import Simulation
+from jaxtrachea.scene.instruments import scene_of
+from jaxtrachea.scene.simulation import Simulation, of_tool
 from jaxtrachea.scene.solids import Triangles, crossings, tool_distance, tool_triangles
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
@@ -65,10 +67,12 @@ class Contact:
 
 
 def draw_surface(
-    scene: Scene, path: Poses | Presses, out: Simulation, row: int, title: str = "",
-    span: float = 32.0,
+    scene: Scene, path: Poses | Presses | Mapping[str, Poses | Presses], out: Simulation, row: int,
+    title: str = "", span: float = 32.0,
 ) -> Figure:  # fmt: skip
     """The deformed tube under the tool from the contact's side, across and along.
+
+    Of several tools all are shown; the section across is at the one that presses most.
 
     Args:
         scene: with a mesh.
@@ -84,9 +88,13 @@ def draw_surface(
     rest, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     vertices = np.asarray(out.vertices[row], float)
     along = np.asarray(mesh.s, float)
-    contact = _contact(mesh, vertices, out, row)
-    near = faces[(np.abs(along[faces] - contact.s) < span).all(axis=1)]
-    tool = _tool(scene, path, row)
+    shown = _of_each(scene, path, out)
+    contacts = [_contact(mesh, vertices, own, row) for *_, own in shown]
+    contacts.sort(key=lambda c: -float(np.linalg.norm(c.force)))  # the strongest leads the camera
+    contact = contacts[0]
+    low, high = min(c.s for c in contacts) - span, max(c.s for c in contacts) + span
+    near = faces[((along[faces] > low) & (along[faces] < high)).all(axis=1)]
+    tool = _joined([_tool(view, own, row) for view, own, _ in shown])
     moved = np.linalg.norm(vertices - rest, axis=1)
     top = max(float(np.nanmax(moved)), 0.01)
     rings = inside_rings(scene, mesh)
@@ -96,12 +104,14 @@ def draw_surface(
     across = figure.add_axes((0.70, 0.56, 0.28, 0.32))
     length = figure.add_axes((0.70, 0.12, 0.28, 0.28))
     wall = Triangles(vertices, near)
-    outline = _print(scene, path, row, wall)
-    _draw_view(view, wall, rest, tool, contact, moved / top, rings, outline)
+    prints = [_print(own, way, row, wall) for own, way, _ in shown]
+    prints = [own for own in prints if own is not None]
+    outline = np.concatenate(prints) if prints else None
+    _draw_view(view, wall, rest, tool, contacts, moved / top, rings, outline)
     if out.joints is not None:
-        _draw_joints(view, scene, mesh, vertices, contact, span)
+        _draw_joints(view, scene, mesh, vertices, contact, (low, high))
     _draw_across(across, Triangles(vertices, near), rest, tool, contact)
-    _draw_length(length, Triangles(vertices, near), rest, tool, contact, along, rings)
+    _draw_length(length, Triangles(vertices, near), rest, tool, contacts, along, rings)
     scale = figure.colorbar(
         ScalarMappable(Normalize(0, top), COLOURS), orientation="horizontal",
         cax=figure.add_axes((0.10, 0.155, 0.40, 0.02)),
@@ -112,17 +122,46 @@ def draw_surface(
     lines = [plain(line, 90) for line in textwrap.wrap(title, 88)[:2]]
     figure.text(0.015, 0.985, "\n".join(lines), ha="left", va="top", fontsize=11)
     figure.text(
-        0.015, 0.985 - 0.04 * max(len(lines), 1) - 0.005, _words(out, row, top), va="top",
+        0.015, 0.985 - 0.04 * max(len(lines), 1) - 0.005, _words(scene, out, row, top), va="top",
         fontsize=8.5, color="0.3",
     )  # fmt: skip
     return figure
 
 
-def _words(out: Simulation, row: int, top: float) -> str:
+def _of_each(scene: Scene, path: Any, out: Simulation):
+    """Scene, path and result of every tool."""
+    if not scene.instruments:
+        return [(scene, path, out)]
+    return [
+        (scene_of(scene, instrument), path[instrument.name], of_tool(out, j))
+        for j, instrument in enumerate(scene.instruments)
+    ]
+
+
+def _joined(tools: list[Triangles | None]) -> Triangles | None:
+    """All tools as one surface."""
+    there = [tool for tool in tools if tool is not None]
+    if not there:
+        return None
+    first = np.cumsum([0, *(len(tool.vertices) for tool in there[:-1])])
+    faces = [tool.faces + i for tool, i in zip(there, first, strict=True)]
+    return Triangles(np.concatenate([tool.vertices for tool in there]), np.concatenate(faces))
+
+
+def _words(scene: Scene, out: Simulation, row: int, top: float) -> str:
     """Row, status, force and largest motion."""
-    status = PressStatus(int(out.status[row]))
     count = len(out.s)
     which = f"row {row + 1} of {count}" + ("" if row == count - 1 else ", the last solved one")
+    if scene.instruments:
+        forces = np.linalg.norm(np.asarray(out.force[row], float), axis=-1)
+        each = zip(scene.names, forces, np.asarray(out.status[row]), strict=True)
+        words = ", ".join(
+            f"{name} {size:.3g} N" + ("" if status == PressStatus.OK else
+                                      f" ({PressStatus(int(status)).name})")
+            for name, size, status in each
+        )  # fmt: skip
+        return f"{which}: {words}; the wall has moved by up to {top:.3g} mm; true scale"
+    status = PressStatus(int(out.status[row]))
     if status == PressStatus.NO_CONTACT:
         return f"{which}: the tool does not touch, so there is no force"
     size = float(np.linalg.norm(np.asarray(out.force[row], float)))
@@ -212,8 +251,9 @@ def _shade(triangles: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.nd
     return 0.5 + 0.5 * np.clip(np.abs(normal @ light), 0, 1), normal[:, 2] > 0
 
 
-def _draw_view(axis: Any, wall, rest, tool, contact, share, rings, outline) -> None:
-    """The tube, its tool and the force, projected."""
+def _draw_view(axis: Any, wall, rest, tool, contacts, share, rings, outline) -> None:
+    """The tube, its tools and their forces, projected."""
+    contact = contacts[0]
     camera = _camera(contact)
     seen = wall.vertices @ camera.T
     triangles = seen[wall.faces]
@@ -248,7 +288,7 @@ def _draw_view(axis: Any, wall, rest, tool, contact, share, rings, outline) -> N
     if tool is not None:
         points = (tool.vertices @ camera.T)[:, :2]
         low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
-    ends = _draw_force(axis, camera, contact)
+    ends = np.concatenate([_draw_force(axis, camera, own) for own in contacts])
     low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     low = low - (2, 15)
     axis.set(xlim=(low[0], high[0] + 2), ylim=(low[1], high[1] + 3), aspect="equal")
@@ -304,13 +344,13 @@ def _draw_scale(axis: Any, camera: np.ndarray, contact: Contact, low, high) -> N
         axis.text(*end, name, fontsize=7.5, color="0.25", ha=ha, va=va)
 
 
-def _draw_joints(axis: Any, scene: Scene, mesh: Mesh, vertices, contact, span) -> None:
+def _draw_joints(axis: Any, scene: Scene, mesh: Mesh, vertices, contact, ends) -> None:
     """Joints on the anterior midline, where it faces the viewer."""
     camera = _camera(contact)
     if camera[2] @ contact.frame[:, 1] < 0.05:
         return
     for s in np.asarray(scene.geometry.ring_positions, float):
-        if abs(s - contact.s) < span:
+        if ends[0] < s < ends[1]:
             which, weight = _nearest(mesh, s, 0.0)
             place = camera @ (weight @ vertices[which])
             axis.plot(*place[:2], "D", color="w", mec="k", mew=0.7, ms=3.2, zorder=5)
@@ -338,15 +378,16 @@ def _draw_across(axis: Any, wall: Triangles, rest, tool, contact: Contact) -> No
     _frame(axis)
 
 
-def _draw_length(axis: Any, wall: Triangles, rest, tool, contact: Contact, along, rings) -> None:
+def _draw_length(axis: Any, wall: Triangles, rest, tool, contacts, along, rings) -> None:
     """The section along the tube through the contact."""
+    contact = contacts[0]
     axes = contact.axes[:, :2]
     point = contact.centre - contact.s * axes[:, 0]
     found, ends = _lines(axis, wall, rest, tool, point, contact.axes[:, 2], axes)
     on = found.at(rings).mean(axis=1) > 0
     axis.add_collection(LineCollection(list(ends[on]), colors=RING, linewidths=3.2, zorder=2.5))
-    tip, force = (contact.tip - point) @ axes, contact.force @ axes
-    _flat_force(axis, tip, force, contact)
+    for own in contacts:
+        _flat_force(axis, (own.tip - point) @ axes, own.force @ axes, own)
     axis.set(aspect="equal", xlabel="s [mm], carina to larynx", ylabel="to the contact [mm]")
     axis.set_title(f"along, at phi = {round(np.degrees(contact.phi), 1) + 0.0:g} deg", fontsize=8.5)
     _frame(axis)

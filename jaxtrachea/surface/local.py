@@ -168,6 +168,7 @@ def fit(
     targets: Float[Array, "centres components"],
     reach: Float[Array, ""],
     way: Float[Array, "3"] | None = None,
+    softness: Float[Array, " centres"] | None = None,
 ) -> Dent:
     """The correction that takes the values `targets` at `centres`, by Cholesky factors.
 
@@ -179,12 +180,16 @@ def fit(
         targets: displacement at each centre, mm; with `way` shares of it, shape (centres, 1).
         reach: r, mm, positive. 2 to 5 spacings keep the condition number below 1e3.
         way: of centres that all move along it, mm: a third of the work.
+        softness: of each target, not negative: what its weight costs, in the units of psi; the
+            target of a softer centre gives way to those of others beside it. None: 0 throughout.
     """
     n = centres.shape[0]
 
     def solve(centres, targets, reach):
-        matrix = _kernel(centres, centres, reach)
+        matrix = kernel(centres, centres, reach)
         ridge = 16 * n * epsilon(matrix.dtype)
+        if softness is not None:
+            ridge = ridge + softness[:, None]
         matrix = matrix + ridge * jnp.eye(n, dtype=matrix.dtype)
         targets = targets.astype(jnp.result_type(targets, matrix))
         factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
@@ -218,7 +223,7 @@ _dot = functools.partial(jnp.dot, precision="highest")
 @jax.custom_jvp
 def _spread(weights, centres, points, reach):
     """Sum of the kernels of all centres at every point; shape (points,)."""
-    return _dot(weights, _kernel(centres, points, reach))
+    return _dot(weights, kernel(centres, points, reach))
 
 
 @functools.partial(_spread.defjvp, symbolic_zeros=True)
@@ -321,8 +326,8 @@ def add_correction(
     return u + _together(dent, [spread(jnp.where(whole, v, jnp.nan)) for v in here])
 
 
-def _kernel(points, centres, reach):
-    """The kernel psi between points and centres; shape (points, centres)."""
+def kernel(points, centres, reach):
+    """Psi between points and centres: 1 at a centre, 0 from `reach` on; (points, centres)."""
     return _psi(_distance(points, centres, reach))
 
 

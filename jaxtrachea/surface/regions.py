@@ -2,9 +2,9 @@ r"""Global shape: the motion of the skeleton's key points carried to every verte
 
 The key points lie on three lines along the tube: J at phi_c, and the ring ends U at -alpha and V at
 +alpha; on each, at the clamp A, the rings and the clamp B (the nodes). The contact C splits the J
-line; of a tool with a width its two edges do. Along the tube a vertex lies in a patch between two
-nodes, round the tube in one of three regions, U-J, J-V and the back V-U. The three lines are
-interpolated along s, then linearly in phi.
+line; of a tool with a width its two edges do, of several tools all contacts. Along the tube a
+vertex lies in a patch between two nodes, round the tube in one of three regions, U-J, J-V and the
+back V-U. The three lines are interpolated along s, then linearly in phi.
 
 - `linear`: displacement vectors, linear between the key points.
 - `hermite` (default): the same, but the transverse displacement of the J line is the beam's cubic,
@@ -85,49 +85,50 @@ class Keys(eqx.Module):
     """Motion of the key points; rows are A, the rings, B (see `clamped`).
 
     Attributes:
-        s_c: contact position, mm; of a tool with a width the two positions of its edges, in order.
-        contact: displacement of C with the skeleton, mm; shape (3,).
+        s_c: contact position, mm; of a tool with a width the two positions of its edges, of several
+            tools all of these, in order.
+        contact: displacement of C with the skeleton, mm; shape (3,). Of each place, if they differ.
         joints: displacement of the J line at the nodes, mm; shape (nodes, 3).
         U: displacement of the ring ends at -alpha, mm; shape (nodes, 3).
         V: displacement of the ring ends at +alpha, mm; shape (nodes, 3).
         slopes: d/ds of the (y, z) displacement of the J line at the nodes; shape (nodes, 2). Only
             `hermite` needs it.
-        contact_slope: the same at C; shape (2,). At each of two edges: shape (2, 2).
+        contact_slope: the same at C; shape (2,). At each of several places: shape (places, 2).
     """
 
-    s_c: Float[Array, "*edges"]
-    contact: Float[Array, "3"]
+    s_c: Float[Array, "*places"]
+    contact: Float[Array, "*own 3"]
     joints: Float[Array, "nodes 3"]
     U: Float[Array, "nodes 3"]
     V: Float[Array, "nodes 3"]
     slopes: Float[Array, "nodes 2"] | None = None
-    contact_slope: Float[Array, "*edges 2"] | None = None
+    contact_slope: Float[Array, "*places 2"] | None = None
 
 
 def clamped(
-    s_c: Float[Array, "*edges"],
-    contact: Float[Array, "3"],
+    s_c: Float[Array, "*places"],
+    contact: Float[Array, "*own 3"],
     joints: Float[Array, "rings 3"],
     U: Float[Array, "rings 3"],
     V: Float[Array, "rings 3"],
     slopes: Float[Array, "rings 2"] | None = None,
-    contact_slope: Float[Array, "*edges 2"] | None = None,
+    contact_slope: Float[Array, "*places 2"] | None = None,
     *,
     clamps: Float[Array, "2 3"] | None = None,
 ) -> Keys:
     """Keys of a tube whose ends do not turn.
 
     Args:
-        s_c: contact position, mm; or those of both edges of a tool with a width, shape (2,).
-        contact: displacement of C, mm.
+        s_c: contact position, mm; or several in order, see `Keys`.
+        contact: displacement of C, mm; of each place, if they differ.
         joints: displacement of the joints J_i, mm; so for `U` and `V`.
         U: of the ring ends at -alpha.
         V: of the ring ends at +alpha.
         slopes: d/ds of (y, z) at the joints.
-        contact_slope: the same at C, or at each edge.
+        contact_slope: the same at C, or at each place.
         clamps: displacement of the ends A and B of the tube as a whole, mm; None: held.
     """
-    held = jnp.zeros_like(contact)
+    held = jnp.zeros(3, contact.dtype)
     first, last = (held, held) if clamps is None else clamps
 
     def between(a, rows, b):
@@ -300,7 +301,7 @@ def _ends(values, s_c):
 
 
 def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None = None):
-    """The J line, with C (or both edges of the tool) as one more node.
+    """The J line, with C (or both edges of the tool, or all of several) as further nodes.
 
     Linear between the nodes; where `slopes` are given (nodes, C), the last components are cubic.
 
@@ -309,9 +310,10 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
         coefficients of 1, t, t^2, t^3 in it, t = 0..1, of each component.
     """
     values, below = joints, []
-    for s in _each(s_c):
+    for i, s in enumerate(_each(s_c)):
         below.append(jnp.sum(nodes[1:-1] <= s))
-        nodes, values = _insert(nodes, s, below[-1]), _insert(values, contact, below[-1])
+        own = contact if contact.ndim == 1 else contact[i]
+        nodes, values = _insert(nodes, s, below[-1]), _insert(values, own, below[-1])
     span, low, high = jnp.diff(nodes), values[:-1], values[1:]
     leave = land = high - low
     if slopes is not None:
@@ -328,7 +330,7 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
 
 
 def _each(v, dimensions: int = 0):
-    """What there is at the contact, or at both edges of a tool with a width."""
+    """What there is at the contact, or at each of several places."""
     return [v] if v.ndim == dimensions else [v[i] for i in range(v.shape[0])]
 
 
@@ -340,7 +342,7 @@ def _combine(shares, fraction, s, beyond, rows):
         shares: U, J and V; shape (blocks, width) each.
         fraction: way through the whole patch; shape (blocks, width), as all of the vertices.
         s: of the vertices, mm.
-        beyond: whether on the side away from A; of C, or of each edge in order.
+        beyond: whether on the side away from A; of C, or of each place in order.
         rows: of each part of a block's patch, shape (blocks, parts, 2 + 8 components): what
             `_joint_line` gives; then, of the first part alone, U, U by fraction, V and V by it.
 
@@ -470,8 +472,9 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     """Interpolate magnitude and angles to the normal, linear between the key points."""
     # The pole is the inward normal at C for a press, else the outward one; the turn jumps at the
     # opposite pole only, far from where the displacements are.
-    phi_c = weights.phi_c
-    pole = jnp.where(phong.radial(phi_c, keys.contact) > 0, 1, -1).astype(phi_c.dtype)
+    phi_c, C = weights.phi_c, keys.contact
+    outward = phong.radial(phi_c, C if C.ndim == 1 else jnp.sum(C, axis=0)) > 0
+    pole = jnp.where(outward, 1, -1).astype(phi_c.dtype)
 
     fade = jax.lax.stop_gradient(phong.FADE * (binding.nodes[-1] - binding.nodes[0]))
 
@@ -479,6 +482,6 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
         return phong.encode(v, phi_c, pole, fade)
 
     joints, U, V = (encode(v.T).T for v in (keys.joints, keys.U, keys.V))
-    channels = _carry(binding, weights, keys.s_c, joints, encode(keys.contact), U, V)
+    channels = _carry(binding, weights, keys.s_c, joints, encode(C.T).T, U, V)
     u = phong.decode(channels.swapaxes(0, 1), phi_c, pole).swapaxes(0, 1)
     return to_vertices(u, binding.blocks)

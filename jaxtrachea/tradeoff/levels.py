@@ -128,6 +128,9 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
     """
     scene, path = staged.scene, staged.path
     material: Any = staged.material
+    if isinstance(path, dict):
+        why = "nothing of several tools is traded for time"
+        raise PlanError("tools", f"{len(path)} tools", why, "leave [plan] out, or give one tool")
     if not scene.plan.mechanics.hangs_on_rings:
         why = "nothing of deforming cross-sections is traded for time"
         raise PlanError("skeleton", "'sections'", why, "leave [plan] out, or give [material]")

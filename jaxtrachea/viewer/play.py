@@ -63,6 +63,11 @@ def of_file(path: Path, title: str = "") -> str:
     except SimulationFileError as error:
         raise PlayError.like(error) from None
     series, rest, tool = stored.simulation, stored.rest, stored.tool
+    if isinstance(tool, dict) or isinstance(stored.path, dict):
+        raise PlayError(
+            "has several tools, and the page plays one", place=str(path),
+            cure="simulate with a single [tool]",
+        )  # fmt: skip
     if rest is None or series.vertices is None:
         raise PlayError(
             "has no surface", place=str(path), cure="simulate with surface = true in [output]"

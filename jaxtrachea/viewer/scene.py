@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtrachea.config import SpecError
 from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.build import Staged, stage
 from jaxtrachea.scene.paths import path_of
@@ -56,6 +57,8 @@ def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> H
         SpecError: a file or a value that cannot be used, with its key.
     """
     spec = load_scene_spec(path)
+    if spec.names:
+        raise SpecError("tool: several tools; the page handles one: give a single [tool]")
     changed, notes = for_a_mouse(spec)
     staged = stage(changed, path.parent, lambda text: begin(text))
     if spec.tool is None:
@@ -105,7 +108,7 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
 
 def _rubs(spec: SceneSpec) -> bool:
     """Whether a tool of this scene sticks and slides by Coulomb's law."""
-    known = spec.tool is not None and spec.tool.friction is not None
+    known = isinstance(spec.tool, ToolSection) and spec.tool.friction is not None
     wished = spec.effects.friction != "off" and spec.effects.contact_point != "per_step"
     return (
         known and wished and (spec.model.contact, spec.model.coupling) == ("unilateral", "series")

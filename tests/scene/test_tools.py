@@ -1,0 +1,428 @@
+"""Several tools in one scene: what each does to the others, the surface, and bad input."""
+
+import dataclasses
+import functools
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from late import late
+from small_scenes import BALL, BARE, SPRINGS, TUBE, ball, presses
+
+from jaxtrachea import (
+    EffectOptions,
+    PlanError,
+    Poses,
+    Presses,
+    Session,
+    Tool,
+    make_scene,
+    press_contacts,
+    read_simulation,
+    simulate,
+)
+from jaxtrachea.contact.shapes import box, sphere
+from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.scene.declare import SceneFacts
+from jaxtrachea.scene.dents import fit, lay_out
+from jaxtrachea.scene.instruments import scene_of
+from jaxtrachea.scene.overlap import overlapping
+from jaxtrachea.scene.results import write_forces, write_simulation
+from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.status import PressStatus
+from jaxtrachea.surface import local
+from jaxtrachea.trachea.tube import make_tube
+
+OK, NO_CONTACT, LIFTED = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.LIFTED
+#: Round, with a vertex at every contact below: s is a multiple of 5 at the ends, 10/3 within.
+ROUND = make_tube(TUBE, around=9, along=40, relief=0.0)
+NEXT = 70 + 20 / 3
+LEFT, RIGHT = presses([0, -4, 0], s=70.0, rows=5), presses([0, -1.2, 0], s=NEXT)
+PRESSED = {"left": LEFT, "right": RIGHT}
+
+
+@functools.cache
+def scene_of_presses(**effects):
+    mesh = None if effects.get("want_surface") is False else ROUND
+    return make_scene(TUBE, SPRINGS, PRESSED, mesh=mesh, effects=EffectOptions(**effects))
+
+
+@functools.cache
+def pressed():
+    return jax.device_get(simulate(scene_of_presses(), SPRINGS, PRESSED))
+
+
+def ways(*paths):
+    """Displacements inwards, side by side; shorter ones rest."""
+    rows = max(len(p.s) for p in paths)
+    columns = [-np.asarray(p.displacement)[:, 1] for p in paths]
+    return np.stack([np.append(v, [v[-1]] * (rows - len(v))) for v in columns], axis=1)
+
+
+def test_forces_are_those_of_press_contacts():
+    out, D = pressed(), ways(LEFT, RIGHT)
+    found = press_contacts(TUBE, SPRINGS, [70.0, NEXT], D)
+    np.testing.assert_allclose(-out.force[:, :, 1], found.force, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(-out.joints[:, :, 1], found.joints, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(-out.loads[:, :, 1], found.reactions, rtol=0, atol=1e-15)
+    assert out.status.tolist() == found.status.tolist()
+    assert out.status[-1].tolist() == [OK, LIFTED]  # the wall comes away from the right one
+    np.testing.assert_allclose(-out.depth[:, :, 1], np.maximum(found.depth, 0), atol=1e-15)
+
+
+def test_surface_passes_through_every_contact():
+    """The vertex at a contact moves as the tool does, to the last digits; the far ones do not."""
+    out, D = pressed(), ways(LEFT, RIGHT)
+    there = (np.abs(ROUND.phi) < 1e-9) & np.isclose(ROUND.distance, 12.6)
+    for j, s in enumerate((70.0, NEXT)):
+        (vertex,) = np.flatnonzero(there & np.isclose(ROUND.s, s))
+        moved = out.vertices[:, vertex] - np.asarray(ROUND.vertices)[vertex]
+        touching = out.status[:, j] == OK
+        np.testing.assert_allclose(-moved[touching, 1], D[touching, j], rtol=0, atol=1e-9)
+    far = np.abs(np.asarray(ROUND.s) - 75) > 70
+    assert np.abs(out.vertices[:, far] - np.asarray(ROUND.vertices)[far]).max() < 1e-4
+
+
+@pytest.mark.slow
+def test_surface_of_one_pressing_tool_is_that_of_one_tool():
+    """A second tool that stays off the wall changes nothing."""
+    away = presses([0, 3.0, 0], s=83.0, rows=5)
+    out = simulate(scene_of_presses(), SPRINGS, {"left": LEFT, "right": away})
+    alone = make_scene(TUBE, SPRINGS, LEFT, mesh=ROUND)
+    one = simulate(alone, SPRINGS, LEFT)
+    assert (np.asarray(out.status[:, 1]) == NO_CONTACT).all()
+    np.testing.assert_allclose(out.force[:, 0], one.force, rtol=0, atol=2e-5)  # the rounded touch
+    np.testing.assert_allclose(out.vertices, one.vertices, rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_order_of_tools_does_not_matter():
+    turned = dict(reversed(PRESSED.items()))
+    scene = make_scene(TUBE, SPRINGS, turned, mesh=ROUND)
+    assert scene.names == ["right", "left"]
+    out, found = pressed(), simulate(scene, SPRINGS, turned)
+    np.testing.assert_allclose(found.force[:, ::-1], out.force, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.vertices, out.vertices, rtol=0, atol=1e-12)
+    again = simulate(scene_of_presses(), SPRINGS, turned)  # the names say which is which
+    np.testing.assert_array_equal(again.force, out.force)
+
+
+def test_mapping_of_one_tool_has_the_axis():
+    path = {"left": LEFT}
+    scene = make_scene(TUBE, SPRINGS, path, effects=BARE)
+    out = simulate(scene, SPRINGS, path)
+    one = simulate(make_scene(TUBE, SPRINGS, LEFT, effects=BARE), SPRINGS, LEFT)
+    assert scene.plan.tools == "one"
+    np.testing.assert_array_equal(out.force[:, 0], one.force)
+    assert out.s.shape == (5, 1)
+    assert out.joints.shape == one.joints.shape
+
+
+@pytest.mark.parametrize("coupling", ["series", *late("total")])
+def test_apart_every_force_is_that_of_its_tool_alone(coupling):
+    wished = {"coupling": coupling} if coupling == "total" else {"tools": "apart"}
+    scene = scene_of_presses(want_surface=False, **wished)
+    assert scene.plan.tools == "apart"
+    out = simulate(scene, SPRINGS, PRESSED)
+    for j, (s, D) in enumerate(zip((70.0, NEXT), ways(LEFT, RIGHT).T, strict=True)):
+        alone = press_contacts(TUBE, SPRINGS, [s], D[:, None]).force[:, 0]
+        if coupling == "total":
+            alone = SPRINGS.k_1 * D + SPRINGS.k_3 * D**3
+        np.testing.assert_allclose(-out.force[:, j, 1], alone, rtol=0, atol=2e-4)
+
+
+def test_a_row_in_which_one_is_refused_has_no_numbers():
+    D = np.zeros((3, 3))
+    D[:, 1] = [-1, np.nan, -1]
+    bad = Presses(np.full(3, 80.0), np.zeros(3), D)
+    out = simulate(scene_of_presses(want_surface=False), SPRINGS, {"left": LEFT, "right": bad})
+    assert out.status[:, 0].tolist() == [NO_CONTACT, PressStatus.NON_FINITE, *[OK] * 3]
+    assert np.isnan(out.force[1]).all()
+    assert np.isnan(out.joints[1]).all()
+    assert np.isfinite(np.delete(np.asarray(out.force), 1, axis=0)).all()
+    off = dataclasses.replace(RIGHT, s=np.full(3, 170.0))
+    out = simulate(scene_of_presses(want_surface=False), SPRINGS, {"left": LEFT, "right": off})
+    assert (np.asarray(out.status)[1:] == PressStatus.OFF_TUBE).all()
+
+
+@pytest.mark.parametrize("half_width", late(0.0, 2.0))
+def test_glued_tools_and_widths(half_width):
+    model = {"contact": "bonded", "half_width": half_width}
+    scene = scene_of_presses(want_surface=False, **model)
+    pulls = {"left": presses([0, 2, 0], s=70.0), "right": presses([0, -1, 0], s=78.0)}
+    out = simulate(scene, SPRINGS, pulls)
+    D = ways(*pulls.values())
+    found = press_contacts(TUBE, SPRINGS, [70.0, 78.0], D, Options(**model))
+    np.testing.assert_allclose(-out.force[:, :, 1], found.force, rtol=0, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_float32():
+    def low(tree):
+        return jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), tree)
+
+    scene = make_scene(low(TUBE), low(SPRINGS), low(PRESSED), effects=BARE)
+    out = simulate(scene, low(SPRINGS), low(PRESSED))
+    assert out.force.dtype == jnp.float32
+    np.testing.assert_allclose(out.force, pressed().force, rtol=0, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_derivatives_against_differences():
+    """Forces, joints and surface by places, ways and material, forward and reverse."""
+    scene = scene_of_presses()
+    weights = np.random.default_rng(1).normal(size=pressed().vertices.shape)
+
+    def value(x):
+        material = dataclasses.replace(SPRINGS, k_1=x[0], EI_L=x[1], k_M=x[2])
+        paths = {
+            "left": dataclasses.replace(
+                LEFT, s=x[3] + jnp.zeros(5), displacement=x[4] * LEFT.displacement
+            ),
+            "right": dataclasses.replace(RIGHT, displacement=3 * x[5] * RIGHT.displacement),
+        }
+        out = simulate(scene, material, paths)
+        return jnp.sum(weights * out.vertices) + jnp.sum(out.force) + jnp.sum(out.joints**2)
+
+    x = jnp.array([0.3, 1.86, 0.1, 71.3, 1.0, 1.0])
+    slope = jax.jit(jax.grad(value))(x)
+    value = jax.jit(value)
+    for i, h in enumerate(1e-5 * np.array(x)):
+        step = h * np.eye(6)[i]
+        difference = (value(x + step) - value(x - step)) / (2 * h)
+        np.testing.assert_allclose(slope[i], difference, rtol=2e-6, atol=1e-6)
+
+
+def test_overlapping_dents_meet_both_points():
+    """From a tenth of a footprint to three; a sum of dents fitted singly misses by the figure."""
+    scene = scene_of_presses()
+    views = [scene_of(scene, instrument) for instrument in scene.instruments]
+    depth, footprint = jnp.array([1.0, 0.6]), float(scene.footprint)
+
+    @jax.jit
+    def missed(apart):
+        s, phi = jnp.stack([70.0 + 0 * apart, 70.0 + apart]), jnp.zeros(2)
+        laid = lay_out(views, s, phi, [LEFT, RIGHT], [None, None])
+        count = scene.plan.dent
+        C = laid.centres[::count]
+        together = sum(local.correction(dent, C) for dent in fit(laid, depth))
+        single = [
+            local.fit(laid.centres[j * count : (j + 1) * count], target, laid.reach)
+            for j, target in enumerate(local.targets(d * jnp.array([0, -1.0, 0]), jnp.zeros(count))
+                                       for d in depth)
+        ]  # fmt: skip
+        singly = sum(local.correction(dent, C) for dent in single)
+        return jnp.max(jnp.abs(together[:, 1] + depth)), jnp.max(jnp.abs(singly[:, 1] + depth))
+
+    found = np.array([missed(share * footprint) for share in (0.1, 0.3, 1.0, 2.0, 3.0)])
+    assert (found[:, 0] < 1e-6).all()
+    assert found[0, 1] > 0.9  # a sum counts the other dent's millimetre twice
+    assert found[-1, 1] < 0.05
+
+
+TWO_BALLS = {
+    "left": ball([70, 1, 0], [70, -2.5, 0], rows=5),
+    "right": ball([80.5, 1.5, 0], [80.5, -2, 0], rows=4),
+}
+
+
+@functools.cache
+def balls():
+    scene = make_scene(
+        TUBE, SPRINGS, TWO_BALLS, tool={"left": BALL, "right": Tool(BALL)}, mesh=ROUND
+    )
+    return scene, jax.device_get(simulate(scene, SPRINGS, TWO_BALLS))
+
+
+@pytest.mark.slow
+def test_balls_press_where_they_touch():
+    """Place and way by geometry, forces by `press_contacts` there; the surface meets both balls."""
+    scene, out = balls()
+    assert scene.plan.dent == 16
+    np.testing.assert_allclose(out.s[0], [70.0, 80.5], atol=0.02)
+    s, D = out.s[0], -out.displacement[:, :, 1]
+    found = press_contacts(TUBE, SPRINGS, s, D)
+    np.testing.assert_allclose(-out.force[:, :, 1], found.force, rtol=0, atol=1e-14)
+    assert out.status[-1].tolist() == [OK, OK]
+    alone = press_contacts(TUBE, SPRINGS, s[:1], D[:, :1])
+    assert 1.02 < alone.force[-1, 0] / found.force[-1, 0]  # the other ball has made way
+
+
+@pytest.mark.slow
+def test_files_have_all_tools(tmp_path):
+    scene, out = balls()
+    write_forces(tmp_path / "forces.csv", out, scene.names)
+    table = pd.read_csv(tmp_path / "forces.csv")
+    assert table.tool.tolist() == ["left", "right"] * 5
+    np.testing.assert_array_equal(table.force_y_N, out.force[:, :, 1].ravel())
+    write_simulation(tmp_path / "simulation.h5", scene, SPRINGS, TWO_BALLS, out, {})
+    read = read_simulation(tmp_path / "simulation.h5")
+    np.testing.assert_array_equal(read.simulation.force, out.force)
+    assert list(read.tool) == ["left", "right"]
+    np.testing.assert_array_equal(read.path["right"].translation, TWO_BALLS["right"].translation)
+
+
+@pytest.mark.slow
+def test_a_session_goes_the_same_way():
+    scene, out = balls()
+    session = Session(scene, SPRINGS)
+
+    def pose(name, row):
+        path = TWO_BALLS[name]
+        return path.rotation[row], path.translation[row]
+
+    for row in range(4):
+        found = session.step({name: pose(name, row) for name in TWO_BALLS})
+        np.testing.assert_allclose(found.force, out.force[row], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.vertices, out.vertices[row], rtol=0, atol=1e-10)
+    kept = session.state
+    found = session.step({"left": pose("left", 4)})  # the other stays where it was
+    np.testing.assert_allclose(found.force, out.force[4], rtol=0, atol=1e-12)
+    held = session.force_or_last
+    assert held.status == (OK, OK)
+    np.testing.assert_array_equal(held.force, found.force)
+    lifted = session.step({}, present={"right": False})
+    alone = press_contacts(TUBE, SPRINGS, out.s[0, :1], -out.displacement[4, :1, 1])
+    np.testing.assert_allclose(-lifted.force[:, 1], [alone.force[0], 0], rtol=0, atol=1e-12)
+    session.state = kept
+    np.testing.assert_array_equal(session.step({"right": pose("right", 3)}).force,
+                                  session.step({}).force)  # fmt: skip
+    with pytest.raises(ValueError, match="no tool 'up'; expected 'left', 'right'"):
+        session.step({"up": pose("left", 0)})
+    with pytest.raises(ValueError, match="expected a mapping of names"):
+        session.step(*pose("left", 0))
+    with pytest.raises(ValueError, match=r"'left': rotation \(3,\)"):
+        session.step({"left": (np.zeros(3), np.zeros(3))})
+    broken = session.step({"left": (np.eye(3), np.full(3, np.nan))})
+    assert (broken.status == PressStatus.NON_FINITE).all()
+    assert np.isnan(broken.force).all()
+
+
+def test_tools_that_overlap_in_space():
+    """Two balls by the distance of their centres, and a box beside a ball."""
+    at = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    other = np.array([[6.9, 0, 0], [7.1, 0, 0], [0, 0, 0]])
+    turns = np.broadcast_to(np.eye(3), (3, 3, 3))
+    paths = [Poses(turns, at), Poses(turns, other), Poses(turns, other + 50)]
+    shapes = [sphere(5.0), sphere(2.0), box([1.0, 1.0, 1.0], 0.1)]
+    found = jax.jit(overlapping)([jax.tree.map(jnp.asarray, v) for v in shapes], paths)
+    assert found.tolist() == [[True, True, False], [False] * 3, [True, True, False]]
+
+
+def test_what_does_not_go_together():
+    scene = scene_of_presses(want_surface=False)
+    for path, words in (
+        (LEFT, "path is Presses; expected a mapping of the tools 'left', 'right'"),
+        ({"left": LEFT}, "path has the tools 'left'; expected 'left', 'right'"),
+        ({"left": LEFT, "up": RIGHT}, "path has the tools 'left', 'up'"),
+        ({"left": LEFT, "right": TWO_BALLS["left"]}, "path mixes kinds"),
+        ({"left": LEFT, "right": dataclasses.replace(RIGHT, phi=np.zeros(2))}, "tool 'right'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            simulate(scene, SPRINGS, path)
+    timed = dataclasses.replace(LEFT, time=np.arange(5.0))
+    for right, words in (
+        (RIGHT, "path of tool 'right' has no time; expected one, as 'left' has"),
+        (dataclasses.replace(LEFT, time=np.arange(5.0) + [0, 0, 1, 0, 0]), "from row 3 on"),
+        (dataclasses.replace(RIGHT, time=np.arange(3.0)), "from row 4 on; expected one clock"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            simulate(scene, SPRINGS, {"left": timed, "right": right})
+    for paths, tools, words in (
+        ({}, None, "path has 0 tools; expected 1 to 16"),
+        ({f"{i}": LEFT for i in range(17)}, None, "path has 17 tools; expected 1 to 16"),
+        ({"a": LEFT, "b": LEFT}, None, "path of tool 'b' is that of 'a' in every row"),
+        (TWO_BALLS, BALL, "tool is Shape; expected a mapping of the names of the paths"),
+        (TWO_BALLS, {"left": BALL, "up": BALL}, "tool has the names 'left', 'up'; expected"),
+        (TWO_BALLS, {"left": BALL, "right": 3}, "tool 'right' is 3; expected"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make_scene(TUBE, SPRINGS, paths, tool=tools, effects=BARE)
+    with pytest.raises(ValueError, match="the path moves a tool"):
+        make_scene(TUBE, SPRINGS, TWO_BALLS, effects=BARE)
+
+
+@pytest.mark.parametrize(
+    ("facts", "effects", "words"),
+    [
+        ({"angle": 0.5}, {}, "second_plane 'on'"),
+        ({"known": frozenset({"EI_C", "k_t"})}, {}, "rings 'mat'"),
+        ({"several_points": True}, {}, "contact_point 'fixed'"),
+        ({"poses": True, "slip": 40.0, "spacing": 10.0}, {}, "does not keep its place"),
+        ({"slip": 1.0, "along": 0.5, "friction": True}, {}, "with friction 'off'"),
+        ({"known": frozenset({"sections"})}, {"contact": "bonded"}, r"give \[material\] in the place of"),
+        ({"known": frozenset({"relaxation"}), "timed": True}, {}, "set relaxation 'off'"),
+        ({"known": frozenset({"e_1", "e_2"}), "way_fixed": (0.0, 0.2), "softness": (-1.4, 0.9)}, {},
+         "set skeleton 'linear'"),
+        ({}, {"tools": "one"}, "2 tools have a path"),
+        ({}, {"tools": "coupled", "coupling": "total"}, "contacts do not feel one another"),
+        ({"tools": 1}, {"tools": "coupled"}, "one tool has a path"),
+    ],
+)  # fmt: skip
+def test_what_no_plan_couples(facts, effects, words):
+    with pytest.raises(PlanError, match=words):
+        make_plan(SceneFacts(**({"tools": 2, "mesh": False} | facts)),
+                  EffectOptions(want_surface=False, **effects))  # fmt: skip
+
+
+TOOLS = """
+[material]
+EI_L = "1.9 N mm^2"
+k_M = "0.1 N/mm"
+k_1 = "0.3 N/mm"
+k_3 = "0.02 N/mm^3"
+[[tool]]
+name = "left"
+shape = "sphere"
+radius = "5 mm"
+[[tool]]
+name = "right"
+shape = "sphere"
+radius = "4 mm"
+[[path]]
+tool = "left"
+positions = [["70 mm", "17 mm", "0 mm"]]
+[[path]]
+tool = "right"
+positions = [["80 mm", "16 mm", "0 mm"]]
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "right"', 'name = "left"', "tool.1.name: 'left' is the name of tool.0, too"),
+        ('name = "right"', "", "tool.1.name: missing"),
+        ('tool = "right"', 'tool = "up"', "path.1.tool: there is no tool 'up'; expected 'left'"),
+        ('tool = "right"', "", "path.1.tool: missing; name the tool that it moves"),
+        ('tool = "right"', 'tool = "left"', "tool.1: no path moves 'right'"),
+        ('[[tool]]\nname = "left"', "[plan]\ntolerance = \"1 %\"\n[[tool]]\nname = \"left\"",
+         "plan: a tolerance is for one tool"),
+        ('radius = "4 mm"', 'radius = "4 mm"\nlength = "3 mm"', "length: not for shape 'sphere'"),
+        ('[[path]]\ntool = "left"', '[output]\nplay = true\n[[path]]\ntool = "left"',
+         "output.play"),
+    ],
+)  # fmt: skip
+def test_tables_that_do_not_belong_together(old, new, words):
+    assert SceneSpec.model_validate(tomllib.loads(TOOLS)).names == ["left", "right"]
+    with pytest.raises(ValueError, match=words.replace("[", r"\[")):
+        SceneSpec.model_validate(tomllib.loads(TOOLS.replace(old, new)))
+
+
+def test_one_tool_has_no_name():
+    one = {"shape": "sphere", "radius": "5 mm"}
+    path = {"positions": [["70 mm", "17 mm", "0 mm"]]}
+    material = tomllib.loads(TOOLS)["material"]
+    for tool, leg, words in (
+        (one | {"name": "left"}, path, "tool.name: of several tools alone"),
+        (one, path | {"tool": "left"}, r"path.0.tool: there is one \[tool\]"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            SceneSpec.model_validate({"material": material, "tool": tool, "path": [leg]})
+    many = [{"shape": "sphere", "radius": "5 mm", "name": f"{i}"} for i in range(17)]
+    with pytest.raises(ValueError, match="17 tools; expected at most 16"):
+        SceneSpec.model_validate({"material": material, "tool": many, "path": [path]})
