@@ -17,6 +17,7 @@ from jaxtrachea.inference.residuals import worst
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more, listed
 from jaxtrachea.measurements.curve import BadCurve
 from jaxtrachea.measurements.usage_tables import bad_table
+from jaxtrachea.report.captions import captions
 from jaxtrachea.report.tables import estimate_table, quality_table, spread_table
 
 
@@ -56,9 +57,7 @@ def report_text(
         *data,
         *_sections(findings, "data"),
     ]
-    names = {"fit": "data and fit", "residuals": "residuals"}
-    names |= {"correlation": "correlation"} if result.study.free else {}
-    parts += [f"![{text}]({name}.png)" for name, text in names.items()]
+    parts += [f"![{text}]({name}.png)" for name, text in captions(result).items()]
     if bad:
         table = bad_table(bad)
         parts += [f"## {table.title}", *table.paragraphs()]
