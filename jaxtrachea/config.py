@@ -157,6 +157,8 @@ class DataSection(Section):
     """trials of a specimen that `compare` and `--leave-one-out` leave out together, `[["s035",
     "s125"]]`: mirror images and other twins
     """
+    exclude: list[str] = []
+    """curves that are read and left out, each as specimen/trial, `["T1/s035"]`"""
     baseline: Literal["auto", "slope", "none"] = "auto"
     """line of the force before first touch. `auto`: fitted where a record shows one. `slope`: of
     every curve, and a curve without 5 samples there is left out. `none`: of no curve

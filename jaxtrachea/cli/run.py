@@ -94,7 +94,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
     made = provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
-    ) | {"run": manifest}
+    ) | {"excluded": loaded.data.exclude, "run": manifest}
     write_hdf5(folder / "results.h5", findings, made, loaded.data.model_dump(mode="json"))
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}
