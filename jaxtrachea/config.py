@@ -477,6 +477,13 @@ class DesignSection(Section):
         return self
 
 
+class FitOutputSection(Section):
+    """[output]: what is written."""
+
+    format: Literal["png", "svg"] = "png"
+    """of the pictures; `svg`: lines and text that can be enlarged and edited"""
+
+
 class FitSpec(Section):
     """A whole fit specification."""
 
@@ -502,6 +509,8 @@ class FitSpec(Section):
     """what is done beyond local standard errors"""
     design: DesignSection = Field(default_factory=lambda: DesignSection.model_validate({}))
     """for `jaxtrachea design`"""
+    output: FitOutputSection = Field(default_factory=lambda: FitOutputSection.model_validate({}))
+    """what is written"""
 
 
 def load_fit_spec(path: Path) -> FitSpec:

@@ -139,7 +139,7 @@ WITHIN = {
     ],
     "viewer": [{"frame", "scene", "values"}, {"protocol"}, {"live", "play"}, {"server"}, {"page"}],
     "report": [{"captions", "small_multiples", "tables", "understood"}, {"fit_pictures"},
-               {"plots"}, {"fit"}, {"overview"}],
+               {"explorer", "plots"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table", "specification", "options", "beside"}, {"terminal"},
             {"file_options", "fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"sources"}, {"written_spec"},

@@ -48,16 +48,18 @@ def run(request, stop_if_asked, fit=None):
 def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manifest) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
+    import shlex
 
     import jax
 
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.html import page
-    from jaxtrachea.files.pictures import without_lost
+    from jaxtrachea.files.pictures import with_ending, without_lost
     from jaxtrachea.files.provenance import provenance
     from jaxtrachea.files.table import Table
     from jaxtrachea.fitting.zero_messages import cells
     from jaxtrachea.measurements.usage_tables import usage_rows, usage_section
+    from jaxtrachea.report.explorer import explorer
     from jaxtrachea.report.fit import report_text
     from jaxtrachea.report.plots import draw_all
     from jaxtrachea.report.understood import understood
@@ -66,7 +68,8 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.trials.differences import differing_trials
     from jaxtrachea.trials.repeats import trial_remarks, trial_sentences
 
-    with beside(draw_all, folder, findings) as drawing:
+    ending = loaded.output.format
+    with beside(draw_all, folder, findings, ending) as drawing:
         Table(summary_rows(findings, measurements.bad)).write_csv(folder / "summary.csv")
         Table(parameter_rows(findings)).write_csv(folder / "parameters.csv")
         apart = differing_trials(measurements.curves)
@@ -87,7 +90,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
         text = report_text(title, findings, measurements.bad, used, lines)
         drawn, lost = drawing.result()
     say_lost(lost)
-    text = without_lost(text, lost)
+    text = without_lost(with_ending(text, ending), lost)
     write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -98,7 +101,14 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     write_hdf5(folder / "results.h5", findings, made, loaded.data.model_dump(mode="json"))
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}
-    write_text(folder / "report.html", page(text, pictures, made))
+    names = {path.name for path in folder.iterdir()}
+    influence = findings.get("influence")
+    section = ""
+    if influence is not None:
+        section = explorer(
+            influence, shlex.join(["jaxtrachea", "fit", str(spec)]), loaded.data.exclude
+        )
+    write_text(folder / "report.html", page(text, pictures, made, files=names, explorer=section))
 
 
 def write_tables(folder: Path, findings) -> None:

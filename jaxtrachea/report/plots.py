@@ -25,8 +25,15 @@ from jaxtrachea.report.fit_pictures import (
 BANDED, BINS, FEWEST = 400_000, 60, 20
 
 
-def draw_all(folder: Path, findings: AnalysisResults) -> tuple[list[Path], dict[str, str]]:
+def draw_all(
+    folder: Path, findings: AnalysisResults, ending: str = "png"
+) -> tuple[list[Path], dict[str, str]]:
     """Write the pictures of `captions`, and those of the analyses.
+
+    Args:
+        folder: where to.
+        findings: the fit, and what its analyses have found.
+        ending: of the files: `png` or `svg`.
 
     Returns:
         The paths; and by file name, why a picture could not be drawn: it costs itself only.
@@ -40,12 +47,12 @@ def draw_all(folder: Path, findings: AnalysisResults) -> tuple[list[Path], dict[
         "correlation": partial(draw_correlation, findings.result),
     }
     mine = {f"{name}.png": drawings[name] for name in captions(findings.result)}
-    return _save(folder, mine | _drawings(findings))
+    return _save(folder, mine | _drawings(findings), ending)
 
 
-def draw_analyses(folder: Path, findings: AnalysisResults) -> dict[str, str]:
+def draw_analyses(folder: Path, findings: AnalysisResults, ending: str = "png") -> dict[str, str]:
     """Write the pictures of the analyses alone; why one could not be drawn, by file name."""
-    return _save(folder, _drawings(findings))[1]
+    return _save(folder, _drawings(findings), ending)[1]
 
 
 def _drawings(findings: AnalysisResults) -> dict[str, Any]:
@@ -53,7 +60,8 @@ def _drawings(findings: AnalysisResults) -> dict[str, Any]:
     return {name: draw for drawings in figures for name, draw in drawings.items()}
 
 
-def _save(folder: Path, drawings: dict[str, Any]) -> tuple[list[Path], dict[str, str]]:
+def _save(folder: Path, drawings: dict[str, Any], ending: str) -> tuple[list[Path], dict[str, str]]:
+    drawings = {f"{Path(name).stem}.{ending}": draw for name, draw in drawings.items()}
     with mpl.rc_context(STYLE):
         return save_each(folder, drawings)
 
