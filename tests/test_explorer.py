@@ -56,7 +56,7 @@ def section(found):
 
 
 def data_of(section):
-    text = re.search(r'id="explorer-data">(.*?)</script>', section, re.S).group(1)
+    (text,) = re.findall(r'id="explorer-data">(.*?)</script>', section, re.S)
     return json.loads(text)
 
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.text import Text
 
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.fitted_errors import fitted_errors
@@ -22,8 +24,9 @@ from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.captions import captions
-from jaxtrachea.report.fit_pictures import Shown, draw_force, draw_joints, scale_of
+from jaxtrachea.report.fit_pictures import draw_force, draw_joints, scale_of
 from jaxtrachea.report.plots import STYLE, _draw_bands, _scale, draw_residuals
+from jaxtrachea.report.shown import Shown
 from jaxtrachea.trachea.geometry import table_1
 
 SIGMA = 2e-3
@@ -54,7 +57,7 @@ def overlaps(figure):
         for tick in axis.get_major_ticks():
             if not low <= tick.get_loc() <= high:
                 hidden |= {tick.label1, tick.label2}
-    texts = [t for t in figure.findobj(mpl.text.Text) if t.get_visible() and t not in hidden]
+    texts = [t for t in figure.findobj(Text) if t.get_visible() and t not in hidden]
     boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts if t.get_text().strip()]
     return [
         (a, b)
@@ -221,7 +224,7 @@ def test_a_whole_record_is_drawn_along_its_time(one):
         figure = draw_force(Shown(result))
         assert not overlaps(figure)
     assert {a.get_xlabel() for a in figure.axes} - {""} == {"time [s]"}
-    named = [t.get_text() for t in figure.axes[0].findobj(mpl.legend.Legend)[0].get_texts()]
+    named = [t.get_text() for t in figure.axes[0].findobj(Legend)[0].get_texts()]
     assert named == ["s060", "s060 again"]
 
 

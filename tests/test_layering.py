@@ -138,7 +138,7 @@ WITHIN = {
         {"measure"},
     ],
     "viewer": [{"frame", "scene", "values"}, {"protocol"}, {"live", "play"}, {"server"}, {"page"}],
-    "report": [{"captions", "small_multiples", "tables", "understood"}, {"fit_pictures"},
+    "report": [{"captions", "small_multiples", "tables", "understood"}, {"shown"}, {"fit_pictures"},
                {"explorer", "plots"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table", "specification", "options", "beside"}, {"terminal"},
             {"file_options", "fit", "load", "predict_data", "run", "scene", "selfcheck"},

@@ -59,7 +59,6 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.files.table import Table
     from jaxtrachea.fitting.zero_messages import cells
     from jaxtrachea.measurements.usage_tables import usage_rows, usage_section
-    from jaxtrachea.report.explorer import explorer
     from jaxtrachea.report.fit import report_text
     from jaxtrachea.report.plots import draw_all
     from jaxtrachea.report.understood import understood
@@ -102,12 +101,12 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}
     names = {path.name for path in folder.iterdir()}
-    influence = findings.get("influence")
-    section = ""
+    influence, section = findings.get("influence"), ""
     if influence is not None:
-        section = explorer(
-            influence, shlex.join(["jaxtrachea", "fit", str(spec)]), loaded.data.exclude
-        )
+        from jaxtrachea.report.explorer import explorer
+
+        command = shlex.join(["jaxtrachea", "fit", str(spec)])
+        section = explorer(influence, command, loaded.data.exclude)
     write_text(folder / "report.html", page(text, pictures, made, files=names, explorer=section))
 
 

@@ -172,7 +172,7 @@ def _note(rows: int) -> str:
 def _figure(renderer, tokens: Sequence[Token], i: int, options, env: Mapping[str, Any]) -> str:
     """A picture inside the page."""
     caption = html.escape(tokens[i].content)
-    name = tokens[i].attrs["src"]
+    name = str(tokens[i].attrs["src"])
     data = base64.b64encode(env["pictures"][name]).decode()
     kind = "svg+xml" if name.endswith(".svg") else "png"
     image = f'<img alt="{caption}" src="data:image/{kind};base64,{data}">'

@@ -16,7 +16,8 @@ from jaxtrachea.inference.analyses.influence import influence_cell
 from jaxtrachea.inference.influence import Influence
 from jaxtrachea.inference.labels import lane_label, succeeded
 from jaxtrachea.inference.rows import worst_first
-from jaxtrachea.report.fit_pictures import Shown, along, scale_of
+from jaxtrachea.report.fit_pictures import scale_of
+from jaxtrachea.report.shown import Shown, along
 
 #: Curves of a page, and points of a curve, at most.
 CURVES, POINTS = 300, 60
@@ -81,7 +82,7 @@ def explorer(found: Influence, command: str, excluded: Sequence[str] = ()) -> st
             for n, k in enumerate(kept)
             for t in range(len(result.study.curves[k]))
         ],
-        "scale": _number(scale_of(found.of.studentised[kept])),
+        "scale": _number(scale_of(np.asarray(found.of.studentised)[kept])),
         "along": along(result.study.curves[kept[0]][0])[1],
         "command": command,
         "excluded": list(excluded),
@@ -133,10 +134,10 @@ def _curve(found: Influence, shown: Shown, lane: int, t: int, unknowns: list[int
     }  # fmt: skip
 
 
-def _number(value: float) -> float | None:
+def _number(value: Any) -> float | None:
     """Five digits; None where there is none."""
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
-def _numbers(values: np.ndarray) -> list[float | None]:
+def _numbers(values: Any) -> list[float | None]:
     return [_number(float(v)) for v in values]

@@ -1,25 +1,17 @@
 """Measured and fitted curves, position by position, each above its residuals."""
 
-import functools
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxtrachea.files.pictures import plain
-from jaxtrachea.fitting.fitted_errors import FittedErrors, fitted_errors
-from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.inference.labels import lane_label
-from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
-from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.report.captions import FEW
+from jaxtrachea.report.shown import GREY, Shown, along, position_signs
 from jaxtrachea.report.small_multiples import Cell, small_multiples
 
-#: Positions of a legend; of more, a bar of colours.
-LEGEND = 8
 #: Trials of a panel that are told apart, dots of a curve, and points of a line, at most.
 APART, DOTS, POINTS = 4, 60, 600
 #: 97.5 % of the normal distribution: half the band of the noise, in standard deviations.
@@ -27,108 +19,6 @@ NOISE = 1.96
 #: Panels share their limits unless the largest force is so many times the usual one.
 _ALIKE = 3.0
 _MARKERS, _LINES = "o^sD", ("-", "--", ":", "-.")
-_GREY = "0.35"
-
-
-class Panel(NamedTuple):
-    """What a panel shows: trials of a lane."""
-
-    lane: int
-    trials: tuple[int, ...]
-    title: str
-
-
-class Shown:
-    """What of a fit is drawn one by one; made once for all its pictures."""
-
-    def __init__(self, result: FitResult):
-        """Choose the panels."""
-        self.result = result
-        self.lanes = _lanes(result)
-        places = sorted({c.s_c for k in self.lanes for c in result.study.curves[k]} - {None})
-        self._span = (places[0], places[-1]) if places else (0.0, 0.0)
-        self.places = places
-        panels = [p for k in self.lanes for p in self._panels(k)]
-        self.of = len(panels)
-        kept = np.unique(np.linspace(0, len(panels) - 1, ONE_BY_ONE).round().astype(int))
-        self.panels = panels if len(panels) <= ONE_BY_ONE else [panels[i] for i in kept]
-
-    @functools.cached_property
-    def errors(self) -> FittedErrors:
-        """Of `lanes`, in their order."""
-        return fitted_errors(self.result, np.array(self.lanes))
-
-    def errors_at(self, name: str, lane: int, t: int, sample) -> tuple[np.ndarray, ...]:
-        """Model - data, half the 95 % band of the fit, studentised residual of an observation."""
-        at = self.lanes.index(lane), t, sample
-        result = self.result
-        half = result.uncertainty.half_width[lane] * result.effective.growth[lane]
-        fitted = getattr(self.errors.fitted, name)[at]
-        band = np.where(np.isfinite(fitted), fitted, np.nan) * (
-            half if np.isfinite(half) else np.nan
-        )
-        return (
-            getattr(result.residuals, name)[lane, t, sample],
-            band,
-            getattr(self.errors.studentised, name)[at],
-        )
-
-    @property
-    def title(self) -> str:
-        """What of all is drawn; "" for all."""
-        if len(self.lanes) < self.result.lanes:
-            half = ONE_BY_ONE // 2
-            return (
-                f"{len(self.lanes)} of {self.result.lanes} fits: the {half} worst, then every so "
-                "many to the best; all: summary.csv"
-            )
-        if len(self.panels) < self.of:
-            return f"{len(self.panels)} of {self.of} positions, evenly chosen; all: results.h5"
-        return ""
-
-    def colour(self, s: float | None) -> Any:
-        """By the position along the tube."""
-        if s is None:
-            return _GREY
-        low, high = self._span
-        share = (s - low) / (high - low) if high > low else 0.3
-        return mpl.colormaps["viridis"](0.9 * share)
-
-    def _panels(self, lane: int) -> list[Panel]:
-        """Positions of a lane, or all of it."""
-        curves, name = self.result.study.curves[lane], plain(lane_label(self.result, lane), 30)
-        if self.result.lanes > FEW:
-            return [Panel(lane, tuple(range(len(curves))), name)]
-        groups: dict[tuple, list[int]] = {}
-        for t, c in enumerate(curves):
-            groups.setdefault((-1.0 if c.s_c is None else c.s_c, c.phi_c), []).append(t)
-        prefix = f"{name}, " if self.result.lanes > 1 else ""
-        several = len({phi for _, phi in groups}) > 1
-        return [
-            Panel(lane, tuple(groups[key]), prefix + _place(*key, several) if key[0] >= 0 else name)
-            for key in sorted(groups)
-        ]
-
-
-def _place(s: float, phi: float, several: bool) -> str:
-    angle = f", {np.degrees(phi):.3g}°" if several else ""
-    return f"s = {s:.4g} mm{angle}"
-
-
-def _lanes(result: FitResult) -> list[int]:
-    """Lanes drawn one by one: all of few; of many the worst, then some on the way to the best."""
-    if result.lanes <= ONE_BY_ONE:
-        return list(range(result.lanes))
-    order, half = worst_first(result), ONE_BY_ONE // 2
-    rest = np.linspace(half, result.lanes - 1, ONE_BY_ONE - half).astype(int)
-    return [order[i] for i in [*range(half), *rest]]
-
-
-def along(curve: Curve) -> tuple[np.ndarray, str]:
-    """What a curve is drawn along: a whole record by its time, else the displacement."""
-    if curve.rise is None or curve.time is None:
-        return curve.displacement, "displacement [mm]"
-    return curve.time - curve.time[0], "time [s]"
 
 
 class Trace(NamedTuple):
@@ -166,8 +56,8 @@ def draw_force(shown: Shown, name: str = "force"):
         point = lane, t, slice(len(x))
         off, half, over = (v[: len(x)] for v in shown.errors_at(name, *point))
         used = np.isfinite(off)
-        parts = (x, np.where(used, data, np.nan), np.where(used, np.nan, data), data + off, half)
-        return Trace(*(v[order] for v in (*parts, over)))
+        parts = np.where(used, data, np.nan), np.where(used, np.nan, data), data + off, half, over
+        return Trace(x[order], *(v[order] for v in parts))
 
     traces = [[(t, trace(p.lane, t)) for t in p.trials] for p in shown.panels]
     return _draw(shown, traces, words[0], f"{name.replace('_', ' ')} [N]")
@@ -190,8 +80,8 @@ def draw_joints(shown: Shown):
         measured[curve.joint_rings] = curve.joint_displacement[last]
         off, half, over = shown.errors_at("joints", lane, t, last)
         used = np.isfinite(off)
-        parts = (np.where(used, measured, np.nan), np.where(used, np.nan, measured), measured + off)
-        return Trace(rings, *(v / D for v in parts), half / abs(D), over)
+        first, second = np.where(used, measured, np.nan), np.where(used, np.nan, measured)
+        return Trace(rings, first / D, second / D, (measured + off) / D, half / abs(D), over)
 
     traces = [[(t, trace(p.lane, t)) for t in p.trials] for p in shown.panels]
     return _draw(shown, traces, "s [mm]", "marker / tool [mm/mm]", tool=True)
@@ -215,7 +105,7 @@ def _draw(shown: Shown, traces: list, x_label: str, y_label: str, *, tool: bool 
             trace = trace._replace(x=trace.x + cell.shift)
             _draw_trace(cell.upper, trace, looks[-1])
             beyond |= draw_residual(cell.lower, trace.x, trace.studentised, limit, looks[-1])
-        for s in {curves[t].s_c for t, _ in row} - {None} if tool else ():
+        for s in {curves[t].s_c for t, _ in row} if tool else ():
             cell.upper.axvline(s + cell.shift, color="0.6", lw=0.8, ls=":", zorder=0)
         cell.title(panel.title)
         if 1 < len(row) <= APART and shown.result.lanes <= FEW:
@@ -309,10 +199,10 @@ def _alike(rows: list) -> bool:
 
 def _explain(figure, shown: Shown, *, tool: bool, every: list[Trace], beyond: bool) -> None:
     """The legend of all panels, and what of all they are."""
-    grey = {"color": _GREY}
+    grey: dict[str, Any] = {"color": GREY}
     signs: list[Any] = [Line2D([], [], **grey, marker="o", ls="", ms=3, label="measured")]
     if any(np.isfinite(t.unused).any() for t in every):
-        hollow = {"marker": "o", "ls": "", "ms": 3, "mfc": "none"}
+        hollow: dict[str, Any] = {"marker": "o", "ls": "", "ms": 3, "mfc": "none"}
         signs.append(Line2D([], [], **grey, **hollow, label="not used"))
     signs.append(Line2D([], [], **grey, lw=1.1, label="fit"))
     if any(np.isfinite(t.half).any() for t in every):
@@ -321,7 +211,7 @@ def _explain(figure, shown: Shown, *, tool: bool, every: list[Trace], beyond: bo
     if tool:
         signs.append(Line2D([], [], color="0.6", lw=0.8, ls=":", label="tool"))
     if beyond:
-        red = {"color": "#b4001e", "marker": "^", "ls": "", "ms": 4}
+        red: dict[str, Any] = {"color": "#b4001e", "marker": "^", "ls": "", "ms": 4}
         signs.append(Line2D([], [], **red, label="beyond the scale"))
     if shown.result.lanes > FEW:
         signs += position_signs(shown)
@@ -331,13 +221,3 @@ def _explain(figure, shown: Shown, *, tool: bool, every: list[Trace], beyond: bo
                   bbox_to_anchor=(0, 1), borderaxespad=0.3, columnspacing=1.2)  # fmt: skip
     if shown.title:
         figure.text(0.995, 0.004, shown.title, fontsize=7, ha="right", va="bottom")
-
-
-def position_signs(shown: Shown) -> list[Any]:
-    """What the colours mean: all positions, or of many some."""
-    places = np.array(shown.places)
-    if len(places) < 2:
-        return []
-    if len(places) > LEGEND:
-        places = places[np.linspace(0, len(places) - 1, LEGEND).round().astype(int)]
-    return [Line2D([], [], color=shown.colour(s), lw=2.5, label=f"s = {s:.4g} mm") for s in places]

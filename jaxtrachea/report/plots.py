@@ -13,13 +13,8 @@ from jaxtrachea.fitting.result import FitResult, unknown_label
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
 from jaxtrachea.report.captions import captions
-from jaxtrachea.report.fit_pictures import (
-    Shown,
-    along,
-    draw_force,
-    draw_joints,
-    position_signs,
-)
+from jaxtrachea.report.fit_pictures import draw_force, draw_joints
+from jaxtrachea.report.shown import Shown, along, position_signs
 
 #: Residuals that bands are made of at most, intervals of displacement, and samples in one at least.
 BANDED, BINS, FEWEST = 400_000, 60, 20

@@ -189,7 +189,7 @@ def _mark_interval(axis, found: Profiles, k: int) -> str:
         axis.axvspan(*shown, color="0.5", alpha=0.18, lw=0, label="95 % interval")
     se = result.uncertainty.se[lane, i]
     if np.isfinite(se) and se > 0:
-        theta = np.linspace(*found.coordinate[k][[0, -1]], 101)
+        theta = np.linspace(found.coordinate[k][0], found.coordinate[k][-1], 101)
         local = ((theta - result.theta[lane, i]) / se) ** 2
         at = [p.from_scaled(v) for v in theta]
         axis.plot(at, local, ":", color="k", lw=1, label="local error")
