@@ -20,7 +20,11 @@ from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, draw_left_out
+from jaxtrachea.inference.analyses.profile import draw_profiles
+from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.influence import influence
+from jaxtrachea.inference.profile import profiles
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.captions import captions
@@ -234,3 +238,35 @@ def test_captions_follow_what_was_observed(one, dense_result):
     seen = dataclasses.replace(one.residuals, side_force=one.residuals.force)
     both = dataclasses.replace(one, stored_residuals=seen)
     assert list(captions(both)) == ["fit", "side_force", "residuals", "correlation"]
+
+
+def test_curves_left_out_are_drawn_as_they_are_predicted(one):
+    """Prediction: least squares, weighed by 1/sigma^2, of the other three curves."""
+    found, curves = leave_one_out(one, ONE), one.study.curves[0]
+    X = np.stack([DEPTH, DEPTH**3], 1)
+    for k, t in enumerate(found.trial):
+        rest = [c for i, c in enumerate(curves) if i != t]
+        W = np.concatenate([X / c.sigma[:, None] for c in rest])
+        b = np.linalg.lstsq(W, np.concatenate([c.force / c.sigma for c in rest]), rcond=None)[0]
+        np.testing.assert_allclose(found.residual[k], X @ b - curves[t].force, atol=1e-8)
+    with mpl.rc_context(STYLE):
+        figure = draw_left_out(found)
+        assert not overlaps(figure)
+    drawn = figure.axes[0].lines[:4]
+    assert {line.get_xdata().size for line in drawn} == {12}
+    assert figure.axes[1].get_xlabel() == "s [mm]"
+    assert "![curves left out: measured and predicted](left_out.png)" in LEFT_OUT.section(found)
+    assert list(LEFT_OUT.figures(found)) == ["left_out.png"]
+
+
+def test_one_profile_is_named_with_its_interval(one):
+    """k_1: estimate and interval as the table has them, threshold and estimate drawn."""
+    found = profiles(one, ONE, ("k_1",), points=4)
+    with mpl.rc_context(STYLE):
+        figure = draw_profiles(found)
+        assert not overlaps(figure)
+    (axis,) = [a for a in figure.axes if a.get_visible()]
+    low, high = float(found.lower[0]), float(found.upper[0])
+    assert axis.get_title() == f"k_1: {one.value[0, 0]:.4g} ({low:.4g} … {high:.4g})"
+    words = {t.get_text() for t in axis.get_legend().get_texts()}
+    assert words == {"estimate", "95 % interval", "local error"}
