@@ -65,6 +65,7 @@ TABLES = (
         config.UncertaintySection,
     ),
     ("Fit: [design]", "For `jaxtrachea design`.", config.DesignSection),
+    ("Fit: [output]", "", config.FitOutputSection),
     (
         "Scene: top level",
         "`path` is needed, and `material`, or `sections` or `wall`.",

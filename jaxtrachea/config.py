@@ -158,6 +158,8 @@ class DataSection(Section):
     """trials of a specimen that `compare` and `--leave-one-out` leave out together, `[["s035",
     "s125"]]`: mirror images and other twins
     """
+    exclude: list[str] = []
+    """curves that are read and left out, each as specimen/trial, `["T1/s035"]`"""
     baseline: Literal["auto", "slope", "none"] = "auto"
     """line of the force before first touch. `auto`: fitted where a record shows one. `slope`: of
     every curve, and a curve without 5 samples there is left out. `none`: of no curve
@@ -476,6 +478,13 @@ class DesignSection(Section):
         return self
 
 
+class FitOutputSection(Section):
+    """[output]: what is written."""
+
+    format: Literal["png", "svg"] = "png"
+    """of the pictures; `svg`: lines and text that can be enlarged and edited"""
+
+
 class FitSpec(Section):
     """A whole fit specification."""
 
@@ -501,6 +510,8 @@ class FitSpec(Section):
     """what is done beyond local standard errors"""
     design: DesignSection = Field(default_factory=lambda: DesignSection.model_validate({}))
     """for `jaxtrachea design`"""
+    output: FitOutputSection = Field(default_factory=lambda: FitOutputSection.model_validate({}))
+    """what is written"""
 
 
 def load_fit_spec(path: Path) -> FitSpec:

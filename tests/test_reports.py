@@ -434,6 +434,7 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
         force,
         dense.study,
         dense,
+        residual=np.full((14, DEPTH.size), np.nan),
         converged=np.ones(14, bool),
     )
     table = left_out_table(left_out)
@@ -451,7 +452,7 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
     assert (rows, further) in [(v.cells, v.more) for v in items if not isinstance(v, str)]
     few = LeftOut(
         lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense.study, dense,
-        converged=np.ones(4, bool),
+        residual=np.zeros((4, 1)), converged=np.ones(4, bool),
     )  # fmt: skip
     assert [row[1] for row in left_out_table(few).cells[:-1]] == ["1", "2", "1", "1"]
 

@@ -411,3 +411,43 @@ def test_little_work_is_compiled_without_optimisation(monkeypatch):
     assert not replace(study, model=replace(study.model, options=options)).unoptimised(1)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not study.unoptimised(1)
+
+
+def without(folder, names):
+    """Data of a specification that excludes these curves."""
+    (folder / "spec.toml").write_text(f'[data]\nfiles = "*.csv"\nexclude = {json.dumps(names)}')
+    return read_data(load_fit_spec(folder / "spec.toml"), folder)
+
+
+def test_excluded_curves_are_left_out_and_named(two):
+    """Usable or not; the others are as they would be without their files."""
+    (two / "c.csv").write_bytes(b"\0\0")
+    found = without(two, ["a/1", "c/(all)"])
+    (left,) = found.curves
+    assert (left.specimen, found.bad) == ("b", ())
+    np.testing.assert_array_equal(left.force, curve(1)[1])
+    assert found.notes[-1] == "left out by data.exclude: a/1, c/(all)"
+    assert "a.csv" in str(found.files)
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["a/2"], r"data.exclude.0: no curve is called 'a/2'; expected specimen/trial, one of 'a/1'"),
+        (["a"], r"no curve is called 'a'; expected specimen/trial, one of 'a/1'"),
+        (["zzz"], r"no curve is called 'zzz'.*one of 'a/1', 'b/1'$"),
+        (["b/1", "a/1", "b/1"], r"data.exclude.2: 'b/1' stands twice; name each curve once"),
+    ],
+)  # fmt: skip
+def test_a_name_that_excludes_no_curve_is_refused_with_those_that_are_there(two, names, says):
+    with pytest.raises(SpecError, match=says):
+        without(two, names)
+
+
+def test_a_name_that_two_curves_have_is_refused(two):
+    for file, specimen, trial in (("a", "x/y", "z"), ("b", "x", "y/z")):
+        body = (two / f"{file}.csv").read_text().splitlines()
+        rows = [f"specimen,trial,{body[0]}", *(f"{specimen},{trial},{row}" for row in body[1:])]
+        (two / f"{file}.csv").write_text("\n".join(rows))
+    with pytest.raises(SpecError, match="'x/y/z' are 2 curves, for their names have a slash"):
+        without(two, ["x/y/z"])

@@ -9,6 +9,7 @@ import pytest
 from run_cli import GOOD, run
 
 from jaxtrachea.files.html import ROWS, page
+from jaxtrachea.files.pictures import with_ending
 
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 VOID = {"meta", "img"}
@@ -87,11 +88,27 @@ def test_names_are_no_markup(name):
     assert not {"em", "strong", "a", "b", "s"} & set(read.tags)
 
 
+def test_a_verdict_has_its_colour_and_files_beside_are_links():
+    text = "# T\n\n⚠ **13 of 14.**\n\nAll: `a b.csv`, `none.csv`.\n\n## Of A & B\n\n## Of A & B\n"
+    made = page(text, {}, {}, files={"a b.csv", "x.csv"})
+    assert '<p class="fair">⚠ <strong>13 of 14.</strong></p>' in made
+    assert '<a href="a b.csv"><code>a b.csv</code></a>, <code>none.csv</code>' in made
+    assert Reader(made).links[:3] == ["a b.csv", "#of-a-b", "#of-a-b-"]
+    assert made.index("<nav>") < made.index('<h2 id="of-a-b">') < made.index('<h2 id="of-a-b-">')
+
+
+def test_pictures_may_be_svg():
+    text = with_ending("# T\n\n![a.png](fit.png)\n\nsee (fit.png)\n", "svg")
+    assert text == "# T\n\n![a.png](fit.svg)\n\nsee (fit.png)\n"
+    made = page(text, {"fit.svg": b"<svg/>"}, {})
+    assert "data:image/svg+xml;base64,PHN2Zy8+" in made
+
+
 def test_long_tables_end_with_a_note():
     rows = "\n".join(f"| {i} |" for i in range(ROWS + 5))
     made = page(f"# T\n\n| n |\n| --- |\n{rows}\n", {}, {})
     assert len(Reader(made).tables[0]) == ROWS + 1
-    assert f"The first {ROWS} of {ROWS + 5} rows" in made
+    assert f"The first {ROWS} rows, and 5 more" in made
 
 
 def test_a_picture_that_is_not_there_is_an_error():
@@ -122,10 +139,16 @@ def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
     text, made = (Path(f"out/report.{kind}").read_text() for kind in ("md", "html"))
     read = Reader(made)
     headings = re.findall(r"^##? (.+)", text, re.M)
-    assert "Influence" in headings
-    assert read.headings == [*headings, "Provenance"]
-    assert len(read.tables) == text.count("\n| --- ") + 1
+    assert "Influence of curves" in headings
+    assert read.headings[:2] == [headings[0], "Pictures"]
+    assert set(read.headings) == {*headings, "Provenance", "Explorer"}
+    assert len(read.tables) == text.count("\n| --- ") + 2
     assert sum(link.startswith("data:image/png") for link in read.links) == text.count("![") == 3
-    assert len(read.links) == 3
-    assert not re.search(r"https?:|<script|<link|@import|url\(", made)
+    beside = {path.name for path in Path("out").iterdir()}
+    assert {"influence.csv", "summary.csv", "results.h5"} <= beside & set(read.links)
+    inside = [link.removeprefix("#") for link in read.links if link.startswith("#")]
+    assert len(inside) == len(set(read.headings)) - 1
+    assert all(f'id="{name}"' in made for name in inside)
+    assert not re.search(r"https?:(?!//www.w3.org/2000/svg)|<link|@import|url\(", made)
+    assert made.count("<script") == made.count("</script>") == 2  # of the explorer
     assert any("<script>" in row for table in read.tables for row in table)

@@ -202,7 +202,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
         for reason in findings.unavailable.values():
             raise Stop(f"{spec}: {reason}")
         write_tables(folder, findings)
-        say_lost(draw_analyses(folder, findings))
+        say_lost(draw_analyses(folder, findings, loaded.output.format))
     chosen = (analysis.terminal(found, []) for analysis, found in findings.at("design"))
     show(itertools.chain.from_iterable(chosen), folder.parent)
     raise typer.Exit(1 if measurements.bad else 0)

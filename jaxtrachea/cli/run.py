@@ -48,12 +48,13 @@ def run(request, stop_if_asked, fit=None):
 def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manifest) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
+    import shlex
 
     import jax
 
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.html import page
-    from jaxtrachea.files.pictures import without_lost
+    from jaxtrachea.files.pictures import with_ending, without_lost
     from jaxtrachea.files.provenance import provenance
     from jaxtrachea.files.table import Table
     from jaxtrachea.fitting.zero_messages import cells
@@ -66,7 +67,8 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.trials.differences import differing_trials
     from jaxtrachea.trials.repeats import trial_remarks, trial_sentences
 
-    with beside(draw_all, folder, findings) as drawing:
+    ending = loaded.output.format
+    with beside(draw_all, folder, findings, ending) as drawing:
         Table(summary_rows(findings, measurements.bad)).write_csv(folder / "summary.csv")
         Table(parameter_rows(findings)).write_csv(folder / "parameters.csv")
         apart = differing_trials(measurements.curves)
@@ -87,18 +89,25 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
         text = report_text(title, findings, measurements.bad, used, lines)
         drawn, lost = drawing.result()
     say_lost(lost)
-    text = without_lost(text, lost)
+    text = without_lost(with_ending(text, ending), lost)
     write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
     timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
     made = provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
-    ) | {"run": manifest}
+    ) | {"excluded": loaded.data.exclude, "run": manifest}
     write_hdf5(folder / "results.h5", findings, made, loaded.data.model_dump(mode="json"))
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}
-    write_text(folder / "report.html", page(text, pictures, made))
+    names = {path.name for path in folder.iterdir()}
+    influence, section = findings.get("influence"), ""
+    if influence is not None:
+        from jaxtrachea.report.explorer import explorer
+
+        command = shlex.join(["jaxtrachea", "fit", str(spec)])
+        section = explorer(influence, command, loaded.data.exclude)
+    write_text(folder / "report.html", page(text, pictures, made, files=names, explorer=section))
 
 
 def write_tables(folder: Path, findings) -> None:

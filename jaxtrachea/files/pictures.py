@@ -87,6 +87,11 @@ def without_lost(text: str, lost: Mapping[str, str]) -> str:
     return text
 
 
+def with_ending(text: str, ending: str) -> str:
+    """The text of a report whose pictures have another ending than png."""
+    return re.sub(r"^(!\[[^\n]*\]\(\w+)\.png\)$", rf"\1.{ending})", text, flags=re.M)
+
+
 def grid(count: int, height: float = 2.7):
     """A figure of at least `count` axes in up to three columns, the others hidden; and its axes."""
     from matplotlib.figure import Figure

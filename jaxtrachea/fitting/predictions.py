@@ -30,9 +30,20 @@ class Prediction:
     ends: np.ndarray | None = None
 
 
-def predictions(study: Study, theta: np.ndarray, batch: int = 256) -> Prediction:
-    """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
-    value = map_lanes(residual_value, study, theta, batch=study.batch_size(len(theta), batch))
+def predictions(
+    study: Study, theta: np.ndarray, batch: int = 256, *, like: int | None = None
+) -> Prediction:
+    """Residuals of all lanes at `theta` (lanes, P), in N and mm.
+
+    Args:
+        study: the study.
+        theta: scaled coordinates; (lanes, P).
+        batch: lanes computed together, at most.
+        like: lanes of a study whose program serves; None: as many as these.
+    """
+    like = len(theta) if like is None else like
+    batch, unoptimised = study.batch_size(like, batch), study.unoptimised(like)
+    value = map_lanes(residual_value, study, theta, batch=batch, unoptimised=unoptimised)
     lanes, first = study.lanes, 0
     found: dict[str, Any] = {"joints": None}
     for kind in forces(lanes) + markers(lanes):

@@ -33,6 +33,8 @@ class LeftOut:
             the relative error of the compliance).
         study: the study.
         result: the fits, one lane per left-out curve.
+        residual: model - data of the force of each curve left out, N; NaN where not observed or not
+            predicted; (K, samples).
         converged: whether that fit converged, and the onset and offset of the curve left out; else
             the errors are those of its best point, NaN where it predicts nothing.
     """
@@ -44,6 +46,7 @@ class LeftOut:
     ratio: np.ndarray
     study: Study
     result: FitResult
+    residual: np.ndarray
     converged: np.ndarray
 
     @property
@@ -146,6 +149,7 @@ def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOu
         ratio=np.where(lost, np.nan, ratio),
         study=study,
         result=result,
+        residual=np.where(observed, force, np.nan),
         converged=result.succeeded & touched.converged,
     )
 

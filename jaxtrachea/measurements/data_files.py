@@ -3,6 +3,9 @@
 import contextlib
 import dataclasses
 import re
+from collections import Counter
+from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 
 from jaxtrachea._errors import InputError
@@ -11,6 +14,7 @@ from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.names import appearance
 from jaxtrachea.measurements.read import (
     BadCurve,
+    Curve,
     DataError,
     Measurements,
     ReadOptions,
@@ -18,6 +22,9 @@ from jaxtrachea.measurements.read import (
 )
 from jaxtrachea.measurements.readers import reader_of
 from jaxtrachea.measurements.readers.recognise import is_workbook
+
+#: Names of curves in a message.
+_NAMES = 8
 
 
 def find_files(spec: FitSpec, root: Path) -> list[Path]:
@@ -88,12 +95,13 @@ def _matches(root: Path, pattern: str) -> list[Path]:
 
 
 def read_data(spec: FitSpec, root: Path) -> Measurements:
-    """Read all files of a specification.
+    """Read all files of a specification, and leave out the curves of `data.exclude`.
 
     Of several files, one that cannot be read at all costs one `BadCurve` named after it.
 
     Raises:
-        SpecError: no file, or reading options that contradict each other.
+        SpecError: no file, reading options that contradict each other, or `data.exclude` names a
+            curve that is not there.
         DataError: the only file cannot be read, or two files hold the same specimen and trial.
     """
     names = {f.name for f in dataclasses.fields(ReadOptions)}
@@ -113,13 +121,50 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
     except DataError as error:
         raise SpecError(f"data: {error}") from None
     if len(files) == 1:
-        return read_measurements(files, options)
+        return _without(read_measurements(files, options), spec.data.exclude)
     parts = [_read_one(path, options) for path in files]
     curves = [curve for part in parts for curve in part.curves]
     bad = [curve for part in parts for curve in part.bad]
     notes = dict.fromkeys(note for part in parts for note in part.notes)
     _refuse_twice(parts)
-    return Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
+    whole = Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
+    return _without(whole, spec.data.exclude)
+
+
+def _name(curve: Curve | BadCurve) -> str:
+    """As `data.exclude` names a curve."""
+    return f"{curve.specimen}/{curve.trial}"
+
+
+def _without(whole: Measurements, exclude: Sequence[str]) -> Measurements:
+    """Without the curves that are excluded, usable or not; a note names them.
+
+    Raises:
+        SpecError: a name that no curve or more than one has, or that stands twice.
+    """
+    if not exclude:
+        return whole
+    count = Counter(map(_name, (*whole.curves, *whole.bad)))
+    for i, name in enumerate(exclude):
+        key = f"data.exclude.{i}"
+        if name in exclude[:i]:
+            raise SpecError(f"{key}: {name!r} stands twice; name each curve once")
+        if count[name] > 1:
+            raise SpecError(
+                f"{key}: {name!r} are {count[name]} curves, for their names have a slash; rename "
+                "one of them"
+            )
+        if not count[name]:
+            near = get_close_matches(name, count, _NAMES) or list(count)[:_NAMES]
+            more = f" and {len(count) - len(near)} more" if len(count) > len(near) else ""
+            raise SpecError(
+                f"{key}: no curve is called {name!r}; expected specimen/trial, one of "
+                f"{', '.join(map(repr, near))}{more}"
+            )
+    curves, bad = (tuple(c for c in part if _name(c) not in exclude)
+                   for part in (whole.curves, whole.bad))  # fmt: skip
+    note = f"left out by data.exclude: {', '.join(exclude)}"
+    return dataclasses.replace(whole, curves=curves, bad=bad, notes=(*whole.notes, note))
 
 
 def _read_one(path: Path, options: ReadOptions) -> Measurements:

@@ -8,15 +8,17 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import (
     NOTHING_FITTED,
+    determined_unknowns,
     lane_label,
     outcome,
     succeeded,
     verdict_sentence,
 )
-from jaxtrachea.inference.residuals import worst
-from jaxtrachea.inference.rows import ONE_BY_ONE, and_more, listed
+from jaxtrachea.inference.residuals import where_missed, worst
+from jaxtrachea.inference.rows import ONE_BY_ONE, and_more, listed, over_peak
 from jaxtrachea.measurements.curve import BadCurve
 from jaxtrachea.measurements.usage_tables import bad_table
+from jaxtrachea.report.captions import captions
 from jaxtrachea.report.tables import estimate_table, quality_table, spread_table
 
 
@@ -40,11 +42,13 @@ def report_text(
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
     parts = [
         f"# {title or 'Fit'}",
-        f"{outcome(result, findings.profiles)}; {len(bad)} curves could not be used. A fit is "
-        "of one specimen, or of one curve. How to read this report: docs/read_a_fit.md. All "
-        "numbers: `results.h5`; one row per fit: `summary.csv`; one row per estimate: "
+        *_verdict(findings, len(bad)),
+        "A fit is of one specimen, or of one curve. How to read this report: docs/read_a_fit.md. "
+        "All numbers: `results.h5`; one row per fit: `summary.csv`; one row per estimate: "
         "`parameters.csv` (docs/results.md).",
         *(["\n".join(f"- {line}." for line in understood)] if understood else []),
+        "## Pictures",
+        *(f"![{text}]({name}.png)" for name, text in captions(result).items()),
         *_estimates(findings),
         *_sections(findings, "estimates"),
         "## Quality",
@@ -56,13 +60,33 @@ def report_text(
         *data,
         *_sections(findings, "data"),
     ]
-    names = {"fit": "data and fit", "residuals": "residuals"}
-    names |= {"correlation": "correlation"} if result.study.free else {}
-    parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:
         table = bad_table(bad)
         parts += [f"## {table.title}", *table.paragraphs()]
     return "\n\n".join(parts) + "\n"
+
+
+def _verdict(findings: AnalysisResults, bad: int) -> list[str]:
+    """Whether it was solved, and the worst misfit; a mark for good, fair, poor before each."""
+    result = findings.result
+    solved = [k for k in range(result.lanes) if succeeded(result, k)]
+    every = all(
+        determined_unknowns(result, k, findings.profiles) == len(result.study.unknowns[k])
+        for k in solved
+    )
+    mark = "✗" if len(solved) < result.lanes else "✓" if every and not bad else "⚠"
+    said = [f"{mark} **{outcome(result, findings.profiles)}; {bad} curves could not be used.**"]
+    share = np.where(result.succeeded, over_peak(result), np.nan)
+    if not np.isfinite(share).any():
+        return said
+    lane, beyond = int(np.nanargmax(share)), result.misfit
+    grown = np.any(beyond.flagged & (beyond.ratio > 1))
+    mark = "✗" if result.effective.misses.any() else "⚠" if grown else "✓"
+    return [
+        *said,
+        f"{mark} **Worst misfit: {100 * share[lane]:.2g} % of the peak** (root mean square) of "
+        f"{lane_label(result, lane)}; {where_missed(result, lane)}.",
+    ]
 
 
 def _sections(findings: AnalysisResults, place: str) -> list[str]:

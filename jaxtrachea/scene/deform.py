@@ -182,7 +182,7 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
 def sag(tool: Shape, pose: Poses, points):
     """Distance of the tool, just touching, from points of the rest surface, mm."""
     if tool.radius.ndim == 1:
-        return jnp.min(jax.vmap(_sag, (0, None, None))(tool, pose, points), axis=0)
+        return jnp.min(jax.vmap(sag, (0, None, None))(tool, pose, points), axis=0)
     if tool.vertices.shape[1] == 1:
         centre = product(pose.rotation, tool.vertices[:, 0]) + pose.translation
         off = points - centre[None]

@@ -1,10 +1,12 @@
 """Curves left out, in tables and report."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from jaxtrachea.config import SpecError
+from jaxtrachea.files.pictures import of_all
 from jaxtrachea.files.table import Column, Table
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.study import Study
@@ -12,7 +14,7 @@ from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Prog
 from jaxtrachea.inference.cross_validation import LeftOut, curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.holdout_groups import holdout_sentence
 from jaxtrachea.inference.residuals import rms
-from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
+from jaxtrachea.inference.rows import LINES, ONE_BY_ONE, and_more
 
 _ERRORS = {
     "force_over_model": "force / model",
@@ -76,7 +78,41 @@ def own_onset_sentence(study: Study, which: str) -> list[str]:
 def _section(found: LeftOut) -> list[str]:
     parts = own_onset_sentence(found.study, "A curve left out")
     parts += [f"{text}." for text in holdout_sentence(found.study.holdout_groups)]
-    return [*parts, f"{found.sentence}."] if found.sentence else parts
+    parts += [f"{found.sentence}."] if found.sentence else []
+    return [*parts, "![curves left out: measured and predicted](left_out.png)"]
+
+
+def draw_left_out(found: LeftOut):
+    """Predicted over measured force of every curve left out, and its error by position."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    curves = [found.study.curves[k][t] for k, t in zip(found.lane, found.trial, strict=True)]
+    places = np.array([np.nan if c.s_c is None else c.s_c for c in curves])
+    low, high = np.nanmin([*places, 0.0]), np.nanmax([*places, 1.0])
+    colours = mpl.colormaps["viridis"](0.9 * (np.nan_to_num(places) - low) / (high - low))
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    ends = [0.0]
+    order = np.argsort(-np.nan_to_num(found.force, nan=np.inf), kind="stable")[:LINES]
+    for k in order:
+        measured = curves[k].force
+        predicted = measured + found.residual[k, : len(measured)]
+        step = slice(None, None, max(1, len(measured) // 60))
+        left.plot(measured[step], predicted[step], ".", ms=3, color=colours[k])
+        ends += [*measured[np.isfinite(predicted)], *predicted[np.isfinite(predicted)]]
+    left.plot(
+        [min(ends), max(ends)], [min(ends), max(ends)], "k-", lw=0.7, label="predicted = measured"
+    )
+    left.legend(loc="upper left")
+    title = "curves left out" + of_all(len(order), len(curves), "worst")
+    left.set(xlabel="measured force [N]", ylabel="predicted force [N]", title=title)
+    x = places if np.isfinite(places).any() else np.arange(1, len(curves) + 1)
+    right.scatter(x, 100 * found.force, c=colours, s=14)
+    label = "s [mm]" if np.isfinite(places).any() else "curve [number]"
+    right.set(xlabel=label, ylabel="rms error / peak [%]", title="error of the prediction")
+    right.set_ylim(bottom=0)
+    return figure
 
 
 def _shown(found: LeftOut) -> Iterator[str]:
@@ -98,4 +134,5 @@ LEFT_OUT = Analysis(
     table=lambda found, lanes: left_out_table(found),
     section=_section,
     sentences=_shown,
+    figures=lambda found: {"left_out.png": partial(draw_left_out, found)},
 )

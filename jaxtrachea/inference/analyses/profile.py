@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.pictures import grid, of_all
-from jaxtrachea.files.table import Column, Interval, Table
+from jaxtrachea.files.table import Column, Interval, Table, number
 from jaxtrachea.fitting.result import unknown_label, within_bounds
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import lane_label
@@ -131,44 +131,70 @@ def _figures(found: Profiles):
 def draw_profiles(found: Profiles):
     """Rise of the profile against the parameter, a panel for each parameter, a line for each lane.
 
-    Dotted: the parabola of the local standard error, of the first lane; dashed: threshold.
+    Of one lane with the threshold, the estimate, the interval, and the parabola of the local
+    standard error.
     """
     import matplotlib as mpl
 
     result = found.result
     names = list(dict.fromkeys(p.name for p in result.study.free))
-
-    def of(k):
-        return result.study.unknowns[found.lane[k]][found.unknown[k]][0]
-
-    groups = {n: [k for k in range(len(found.lane)) if of(k).name == n] for n in names}
+    pairs = found.pairs
     place = {lane: n for n, lane in enumerate(listed(result, LINES))}
     groups = {
-        n: sorted(members, key=lambda k: place.get(found.lane[k], LINES))
-        for n, members in groups.items()
-        if members
+        name: sorted(
+            (
+                k
+                for k, (lane, i) in enumerate(pairs)
+                if result.study.unknowns[lane][i][0].name == name
+            ),
+            key=lambda k: place.get(pairs[k][0], LINES),
+        )
+        for name in names
     }
+    groups = {name: members for name, members in groups.items() if members}
     figure, axes = grid(len(groups))
-    for axis, members in zip(axes, groups.values(), strict=False):
-        p, first = of(members[0]), members[0]
+    for n, (axis, members) in enumerate(zip(axes, groups.values(), strict=False)):
+        first = members[0]
+        p, threshold = result.study.unknowns[pairs[first][0]][pairs[first][1]][0], found.threshold
         colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(members)))
+        wide = np.ptp(found.coordinate[members]) > np.log(20)
+        axis.set_xscale("log" if p.scale == "log" and wide else "linear")
         for k, colour in zip(members[:LINES], colours, strict=False):
             at = np.array([p.from_scaled(v) for v in found.coordinate[k]])
             axis.plot(at, found.statistic[k], ".-", color=colour, lw=0.9, ms=3)
-        lane, unknown = found.lane[first], found.unknown[first]
-        se = result.uncertainty.se[lane, unknown]
-        if np.isfinite(se):
-            ends = found.coordinate[first]
-            theta = np.linspace(ends[0], ends[-1], 101)
-            local = ((theta - result.theta[lane, unknown]) / se) ** 2
-            axis.plot([p.from_scaled(v) for v in theta], local, ":", color="k", lw=1)
-        axis.axhline(found.threshold[first], ls="--", color="tab:red", lw=0.9)
-        wide = np.ptp(found.coordinate[members]) > np.log(20)
-        axis.set_xscale("log" if p.scale == "log" and wide else "linear")
-        axis.set_ylim(-0.2, 2.2 * found.threshold[first])
+        axis.axhline(threshold[first], ls="--", color="#b4001e", lw=0.9)
+        axis.text(0.99, threshold[first], "95 %", transform=axis.get_yaxis_transform(),
+                  ha="right", va="bottom", fontsize=7, color="#b4001e")  # fmt: skip
+        axis.set_ylim(-0.2, 2.2 * threshold[first])
         title = p.name + of_all(min(len(members), LINES), len(members), "worst fits")
-        axis.set(title=title, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
+        if len(members) == 1:
+            title += f": {_mark_interval(axis, found, first)}"
+        axis.set_title(title, fontsize=9)
+        axis.set(xlabel=f"{p.name} [{p.unit}]", ylabel="rise of -2 ln L [1]")
+        if n == 0 and len(members) == 1:
+            axis.legend(loc="upper center", frameon=True, framealpha=0.9, edgecolor="w")
     return figure
+
+
+def _mark_interval(axis, found: Profiles, k: int) -> str:
+    """Estimate, 95 % interval and local parabola of one profile; the numbers in words."""
+    result, (lane, i) = found.result, found.pairs[k]
+    p, value = result.study.unknowns[lane][i][0], float(result.value[lane, i])
+    axis.axvline(value, color="k", lw=0.8, label="estimate")
+    ends = [float(v[k]) for v in (found.lower, found.upper)]
+    low, high = (p.from_scaled(float(v)) for v in found.coordinate[k][[0, -1]])
+    shown = [e if np.isfinite(e) and e > 0 or p.scale != "log" else d
+             for e, d in zip(ends, (low, high), strict=True)]  # fmt: skip
+    if np.isfinite(shown).all():
+        axis.axvspan(*shown, color="0.5", alpha=0.18, lw=0, label="95 % interval")
+    se = result.uncertainty.se[lane, i]
+    if np.isfinite(se) and se > 0:
+        theta = np.linspace(found.coordinate[k][0], found.coordinate[k][-1], 101)
+        local = ((theta - result.theta[lane, i]) / se) ** 2
+        at = [p.from_scaled(v) for v in theta]
+        axis.plot(at, local, ":", color="k", lw=1, label="local error")
+    cell = Interval(float(found.lower[k]), float(found.upper[k]), p.scale == "log")
+    return f"{number(value)} ({Column('', '', digits=4).text({'': cell})})"
 
 
 PROFILES = Analysis(

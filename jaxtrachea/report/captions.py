@@ -1,0 +1,20 @@
+"""Which pictures of a fit there are, and what stands below each; matplotlib is not needed here."""
+
+from jaxtrachea.fitting.result import FitResult
+
+#: Fits whose positions have a panel each; of more, a panel is a fit.
+FEW = 3
+
+
+def captions(result: FitResult) -> dict[str, str]:
+    """By name of the file without its ending, in the order of the report."""
+    seen, few = result.residuals, result.lanes <= FEW
+    found = {"fit": "data and fit, with residuals in standard deviations"}
+    if few and seen.joints is not None:
+        found["joints"] = "markers at the largest displacement, and fit"
+    if few and seen.side_force is not None:
+        found["side_force"] = "side force and fit"
+    found["residuals"] = "residuals of the force"
+    if result.study.free:
+        found["correlation"] = "correlation of the estimates"
+    return found
