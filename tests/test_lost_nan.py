@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from late import late
 
 from jaxtrachea._numerics import largest
 from jaxtrachea.contact.shapes import sphere
@@ -25,8 +24,6 @@ from jaxtrachea.scene import trail
 from jaxtrachea.scene.stage import Poses
 from jaxtrachea.status import FitStatus, PressStatus
 
-DTYPES = ["float64", *late("float32")]
-
 
 @jax.jit
 def computed(x):
@@ -34,12 +31,11 @@ def computed(x):
     return x * 0 / (x * 0)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("shape", [(4096,), (4101,), (512, 9), (64, 130)])
-def test_the_largest_of_many_is_no_number(shape, dtype):
+def test_the_largest_of_many_is_no_number(shape):
     """One computed NaN at each of three places: its row is NaN, and the others are as by numpy."""
-    x = np.random.default_rng(1).normal(size=shape).astype(dtype)
-    nan = np.asarray(computed(jnp.ones((), dtype)))
+    x = np.random.default_rng(1).normal(size=shape).astype("float64")
+    nan = np.asarray(computed(jnp.ones((), "float64")))
     found = jax.jit(largest)
     np.testing.assert_array_equal(found(x), x.max(axis=-1))
     for at in (0, x.size // 2, x.size - 1):

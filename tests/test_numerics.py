@@ -117,7 +117,7 @@ def test_cosine_and_sine_have_derivatives():
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 9, 32, 33, 64, 97, 120, 121, 128, 1000, 1500])
+@pytest.mark.parametrize("n", [1, 3, 9, 33, 121, 1500])
 def test_total_and_largest(n, dtype):
     """Against exact sums, with entries of both signs, in rows, at every way of summing."""
     x = np.random.default_rng(n).normal(size=(2, 3, n)).astype(dtype)

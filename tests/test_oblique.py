@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from late import late
 
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import (
@@ -27,7 +26,6 @@ from jaxtrachea.trachea.material import Material
 
 pytestmark = pytest.mark.compiling
 
-DTYPES = ["float64", *late("float32")]
 ALPHA = 2 * math.pi / 3
 VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02, "EA_L": 3.9, "EI_C": 13.0, "k_t": 0.4}
 MORE = {"k_A": 0.5, "k_B": 2.0, "EI_side": 5.0}
@@ -143,20 +141,19 @@ def test_mirror(rings):
     np.testing.assert_allclose(two.end_U, np.asarray(one.end_V) * flip, atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 @pytest.mark.parametrize(
     "options", [Options(), Options(coupling="total", shear=True, local="two-material")], ids=repr
 )
-def test_normal_on_the_midline_is_press(options, dtype):
+def test_normal_on_the_midline_is_press(options):
     """Same law, ligament, touch and rings: `press` to rounding, sideways nothing."""
     changes = {"GA_L": 1.1, "k_1_ring": 0.9} if options.shear else {}
     depth = np.array([-0.5, 0.0, 0.2, 1.0, 3.0])
     D = depth[:, None] * np.array([0.0, -1.0, 0.0])
-    got = pressed(44.0, 0.0, D, options, "mat", dtype=dtype, **changes)
+    got = pressed(44.0, 0.0, D, options, "mat", dtype="float64", **changes)
     run = jax.jit(functools.partial(press, options=options), compiler_options=QUICK)
-    s, d = jnp.asarray(44.0, dtype), jnp.asarray(depth, dtype)
-    one = run(table_1(dtype=dtype), material(dtype, **changes), s, d)
-    rtol = 100 * np.finfo(dtype).eps
+    s, d = jnp.asarray(44.0, "float64"), jnp.asarray(depth, "float64")
+    one = run(table_1(dtype="float64"), material("float64", **changes), s, d)
+    rtol = 100 * np.finfo("float64").eps
 
     def close(a, b):
         return np.testing.assert_allclose(a, b, atol=rtol * np.max(np.abs(b)), rtol=0)
@@ -167,7 +164,7 @@ def test_normal_on_the_midline_is_press(options, dtype):
     close(-got.loads[..., 1], one.reactions)
     np.testing.assert_array_equal(got.status, one.status)
     np.testing.assert_array_equal(got.force[:, 0], 0)
-    assert got.force.dtype == dtype
+    assert got.force.dtype == "float64"
 
 
 def test_reciprocity_and_ends():
@@ -357,19 +354,18 @@ value_of = jax.jit(_values, compiler_options=QUICK)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("D", [[0.3, -1.0, 0.5], [0.0, 0.0, 0.0]])
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
-def test_gradients(D, dtype):
+def test_gradients(D):
     """Forward = reverse = central differences through the whole, also without displacement."""
     point = VALUES | MORE | {"s": 63.0, "phi": 0.4, "D": np.array(D)}
-    here = {n: jnp.asarray(v, dtype) for n, v in point.items()}
+    here = {n: jnp.asarray(v, "float64") for n, v in point.items()}
     forward = forward_of(here)
     w = weights[: forward["s"].shape[0]]
-    reverse = reverse_of(here, jnp.asarray(w, dtype))
+    reverse = reverse_of(here, jnp.asarray(w, "float64"))
     for name, v in point.items():
         ahead, back = (np.asarray(of[name], float) for of in (forward, reverse))
         size = np.max(np.abs(ahead)) + 1e-9
         combined = np.tensordot(w, ahead, 1)
-        close = 5e3 * np.finfo(dtype).eps * size * np.linalg.norm(w)
+        close = 5e3 * np.finfo("float64").eps * size * np.linalg.norm(w)
         np.testing.assert_allclose(combined, back, atol=close, rtol=0)
         direction = np.ones(np.shape(v))
         step = 1e-5 * max(1.0, float(np.max(np.abs(v))))
@@ -383,7 +379,7 @@ def test_gradients(D, dtype):
             for e in (step, -step)
         )
         along = np.tensordot(ahead, direction, np.ndim(v))
-        close = max(1e4 * np.finfo(dtype).eps, 3e-7) * size
+        close = max(1e4 * np.finfo("float64").eps, 3e-7) * size
         np.testing.assert_allclose(along, (up - down) / (2 * step), atol=close, rtol=0)
 
 

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from late import late
 from scipy.linalg import solve_banded
 
 from jaxtrachea.mechanics.ring import (
@@ -23,7 +22,6 @@ from jaxtrachea.status import RingStatus
 ALPHA = 2 * math.pi / 3
 TABLE_1 = {"radius": 11.3, "half_angle": ALPHA, "EI": 13.0, "k_M": 0.1, "k_t": 0.4}
 ANGLES = (0.0, 0.4, 1.9)
-DTYPES = ["float64", *late("float32")]
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
 
 compliance = jax.jit(ring_compliance, static_argnames="order", compiler_options=QUICK)
@@ -155,18 +153,17 @@ def test_crown_press_opens_the_ring():
 
 
 @pytest.mark.parametrize("EI", [1e12, math.inf])
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_rigid_arch_is_the_mat(EI, dtype):
+def test_rigid_arch_is_the_mat(EI):
     """Crown press: exactly P / k_M, the paper's d_i = P_i / k; a lateral one turns the ring too."""
-    ring = ring_of(dtype, EI=EI)
+    ring = ring_of("float64", EI=EI)
     C = C_of(ring, 0.0)
-    eps = np.finfo(dtype).eps
+    eps = np.finfo("float64").eps
     np.testing.assert_allclose(C[0, 0], 10, rtol=4 * eps + 1e4 / EI)
     b, rise = math.sin(ALPHA), 1 - math.cos(ALPHA)
     np.testing.assert_allclose(C[1, 1], 10 * (1 + (rise / b) ** 2), rtol=8 * eps + 1e4 / EI)
-    e = jnp.asarray([1.0, 0.0], dtype)
+    e = jnp.asarray([1.0, 0.0], "float64")
     for level in ("mat", "arch"):
-        k, status = stiffness(ring, jnp.asarray(0.0, dtype), e, level=level)
+        k, status = stiffness(ring, jnp.asarray(0.0, "float64"), e, level=level)
         np.testing.assert_allclose(k, 0.1, rtol=8 * eps + 1e4 / EI)
         assert status == RingStatus.OK
 
@@ -187,10 +184,9 @@ def test_limits_of_the_tie():
     np.testing.assert_allclose(both, C_of(ring_of(EI=math.inf), 0.4), rtol=1e-14)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_ends_of_the_ring_and_behind(dtype):
+def test_ends_of_the_ring_and_behind():
     """At the ends the load stands on a spring; behind them there is no answer, and it is said."""
-    ring, load = ring_of(dtype), jnp.asarray([1.0, 0.0], dtype)
+    ring, load = ring_of("float64"), jnp.asarray([1.0, 0.0], "float64")
     end = response(ring, ring.half_angle, load)
     assert end.status == RingStatus.OK
     np.testing.assert_allclose(end.end_V[0], 20, rtol=1e-6)  # all of P on one k_M / 2
@@ -199,11 +195,11 @@ def test_ends_of_the_ring_and_behind(dtype):
     near = response(ring, ring.half_angle - 1e-5, load)
     np.testing.assert_allclose(near.joint, end.joint, rtol=1e-3, atol=1e-3)
     # One lane behind the gap leaves the others alone.
-    phi = jnp.asarray([0.4, -2.2, math.pi, jnp.nan], dtype)
+    phi = jnp.asarray([0.4, -2.2, math.pi, jnp.nan], "float64")
     C, status = jax.jit(jax.vmap(ring_compliance, (None, 0)))(ring, phi)
     wanted = ["OK", "BEHIND_GAP", "BEHIND_GAP", "NON_FINITE"]
     np.testing.assert_array_equal(status, [RingStatus[name] for name in wanted])
-    np.testing.assert_allclose(C[0], C_of(ring, 0.4), rtol=8 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(C[0], C_of(ring, 0.4), rtol=8 * np.finfo("float64").eps)
     assert np.all(np.isnan(C[1:]))
     behind = response(ring, phi[2], load)
     assert behind.status == RingStatus.BEHIND_GAP
@@ -291,7 +287,7 @@ value = jax.jit(_all, compiler_options=QUICK)
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("phi", [0.0, 0.4, -1.9])
+@pytest.mark.parametrize("phi", [0.0, -1.9])
 @pytest.mark.parametrize("changes", [{}, {"k_t": 20.0, "EI": 1e3}, {"k_t": 0.975}])
 def test_gradients(phi, changes):
     """Forward = reverse = central differences in everything; k_t = 0.975 is where k_e = 1."""
@@ -309,10 +305,7 @@ def test_gradients(phi, changes):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    "changes",
-    [{"EI": math.inf}, {"k_t": 0.0}, {"k_t": math.inf}, {"phi": ALPHA}, {"phi": 3.0}],
-)
+@pytest.mark.parametrize("changes", [{"EI": math.inf}, {"k_t": math.inf}, {"phi": ALPHA}])
 def test_gradients_at_the_edges_are_finite(changes):
     point = TABLE_1 | {"phi": 0.4, "at": 0.4, "P_y": 0.7, "P_z": -0.4} | changes
     point = {k: jnp.asarray(v) for k, v in point.items()}
