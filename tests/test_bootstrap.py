@@ -113,7 +113,7 @@ def test_blocks_see_correlated_noise():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("block", [1, 3, 5, 8])
+@pytest.mark.parametrize("block", [3, 8])
 def test_blocks_of_white_noise_give_the_errors_of_single_samples(block):
     """True error by the closed form; 40 specimens of two curves of 22 samples.
 
@@ -235,9 +235,9 @@ def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("kind", ["parametric", "residual"])
-def test_markers_are_resampled_as_well(kind):
+def test_markers_are_resampled_as_well():
     """Four unknowns from forces and markers: bootstrap and local errors agree to 15 %."""
+    kind = "residual"
     force, joints = synthetic.forces(np.array([[300.0, 1.0, 0.5, 0.2]]))
     rng = np.random.default_rng(2)
     force = force + 0.01 * force.max() * rng.normal(size=force.shape)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.optimize
 from jitted import jitted
-from late import late
 
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb, slide, slide_path
@@ -116,10 +115,10 @@ def reference(D, C, k_1, k_3, mu):
     return np.array(forces), np.array(slips)
 
 
-@pytest.mark.parametrize("k_3", [1.0, *late(0.02)])
 @pytest.mark.parametrize("mu", [0.2, MU])
-def test_against_events(mu, k_3):
+def test_against_events(mu):
     """A curved path with changing pressure on a coupled skeleton with a hardening law."""
+    k_3 = 1.0
     t = np.linspace(0, 2 * np.pi, 40)
     D = np.stack([1.5 + 0.5 * np.sin(2 * t), 2 * np.sin(t), 1.5 - 1.5 * np.cos(t)], 1)
     got = path(D, COUPLED, 0.7, k_3, mu)
@@ -354,9 +353,9 @@ def test_gradients(rounding):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rounding", [0.0, 0.05])
-def test_gradient_at_rest_is_finite(rounding):
+def test_gradient_at_rest_is_finite():
     """No tangential motion, no pressure: nothing divides by the length of zero."""
+    rounding = 0.0
     C, local, mu = jnp.asarray(COUPLED), Law(jnp.asarray(0.5), jnp.asarray(0.1)), jnp.asarray(MU)
     D = jnp.asarray([[0.0, 0, 0], [1.0, 0, 0], [-1.0, 2, 0], [0.0, 1, 0]])
 
@@ -396,9 +395,9 @@ def summed(quintic):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("quintic", [False, True])
-def test_softening_steps_are_right_or_refused(quintic):
+def test_softening_steps_are_right_or_refused():
     """Each solved step fulfils the equations, in double precision; its gradient is finite."""
+    quintic = True
     given = softening(3000, quintic, "float64")
     step = jax.value_and_grad(summed(quintic), (0, 1, 2, 3, 5), has_aux=True)
     (_, got), slopes = jax.jit(jax.vmap(step), compiler_options=QUICK)(*given)

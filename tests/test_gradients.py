@@ -255,11 +255,9 @@ def pressing(options):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    "options", [Options(coupling="total", form="reactions", split="independent")]
-)
-def test_press(options):
+def test_press():
     """The whole pipeline, by every leaf of material and geometry, s_c, displacement and onset."""
+    options = Options(coupling="total", form="reactions", split="independent")
     D = np.array([0.3, 1.1, 2.5])
     values = {"x": RINGS, "length": 61.0, "s": 26.7, "D": D, "onset": 0.1} | MATERIAL
     check(pressing(options), values, rtol=1e-6)

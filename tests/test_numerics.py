@@ -32,7 +32,7 @@ DTYPES = ["float64", *late("float32")]
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("width", [0.0, 1e-3, 2.0])
+@pytest.mark.parametrize("width", [0.0, 1e-3])
 def test_positive_part(width, dtype):
     """Exactly 0 below, exactly x above, rising between, and never above max(x, 0) + nothing."""
     w = jnp.asarray(width, dtype)

@@ -96,9 +96,9 @@ def turned(angle):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(("dtype", "rounding"), [("float32", 3e-5), ("float64", 1e-11)])
-def test_sphere_against_an_endless_cylinder(dtype, rounding):
+def test_sphere_against_an_endless_cylinder():
     """Too small by at most the bound; point, normal and phi across exactly, s within the tilt."""
+    dtype, rounding = "float64", 1e-11
     s, phi, away, at, turn = places(1000)
     c = solve(TOOLS["sphere"], TUBE, turn, at, dtype=dtype)
     error = c.gap - (away - R - 2)

@@ -21,7 +21,6 @@ from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import influence as analysis
 from jaxtrachea.inference.design.candidates import Candidates, candidates_of
 from jaxtrachea.inference.design.choice import gains, next_points
-from jaxtrachea.inference.design.identifiability import identifiability
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import _external, influence
 from jaxtrachea.inference.population import population
@@ -144,19 +143,6 @@ def test_profile_is_the_refit_at_every_point(result):
 
 
 @pytest.mark.slow
-def test_profile_of_little_noise_is_that_of_the_covariance():
-    """With a hundredth of the noise the model is straight across the interval."""
-    sigma = SIGMA / 100
-    result = fit(study_of(measured(0, sigma), sigma=sigma), ONE)
-    found = profiles(result, ONE, points=2)
-    half = np.sqrt(CHI2) * result.uncertainty.se[0]
-    np.testing.assert_allclose(np.log(found.upper) - result.theta[0], half, rtol=2e-3)
-    np.testing.assert_allclose(result.theta[0] - np.log(found.lower), half, rtol=2e-3)
-    away = (found.coordinate - result.theta[0][:, None]) / result.uncertainty.se[0][:, None]
-    np.testing.assert_allclose(found.statistic, away**2, rtol=4e-3, atol=1e-9)
-
-
-@pytest.mark.slow
 def test_joint_fit_is_dense_least_squares():
     """Two specimens, one bed: estimates and standard errors of SciPy on all residuals at once."""
     curves = [measured(1), measured(2, specimen="two", EI_C=24.0)]
@@ -231,20 +217,6 @@ def test_predicted_error_is_that_of_a_fit_with_the_press_added():
     # Bounds count as a prior in the prediction: no more than a thousandth here.
     np.testing.assert_allclose(choice.error[1], after.uncertainty.se[0], rtol=1e-3)
     np.testing.assert_allclose(choice.error[0], result.uncertainty.se[0], rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_candidate_without_equilibrium_tells_nothing(known):
-    """Past what the model presses: zeros, beside another as it is alone; never chosen."""
-    alone = gains(known, Candidates(np.array([15.0]), np.array([3.0])))
-    both = Candidates(np.array([15.0, 15.0]), np.array([3.0, 30.0]))
-    found = gains(known, both)
-    np.testing.assert_array_equal(found[:, 1], 0)
-    np.testing.assert_allclose(found[:, :1], alone)
-    assert np.all(found[:, 0].diagonal(axis1=1, axis2=2) > 0)
-    assert next_points(known, both).chosen.tolist() == [0]
-    chart = identifiability(known, np.array([15.0, 20.0]), 30.0)
-    assert np.all(np.isinf(chart.pairs))
 
 
 def test_angles_of_candidates():

@@ -23,9 +23,9 @@ def test_oblique_presses_refuse(changes):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("contact_point", ["fixed", "per_step"])
-def test_plan_refuses_a_split_without_an_energy(contact_point):
+def test_plan_refuses_a_split_without_an_energy():
     """Of a tool that wanders; a place that is kept, and presses at places, have it."""
+    contact_point = "per_step"
     effects = dataclasses.replace(BARE, contact_point=contact_point)
     plan = make_scene(
         TUBE, MATERIAL, ball([75, 1, 0], [75, -2, 0]), tool=BALL, effects=effects

@@ -85,23 +85,6 @@ def test_rows_are_presses_of_their_own_in_any_order():
 
 
 @pytest.mark.slow
-def test_float32():
-    """Within its roundings of float64: a Newton step leaves some 1e-4 of the force."""
-
-    def single(tree):
-        return jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), tree)
-
-    path = straight([75.0, 70.0, 75.0, 75.0, 22.0], [0.5, 0.0, -0.5, 0.5, 1.2], [4.0, 2, 4, 0, 1])
-    short = run(*(single(v) for v in (ANYWHERE, WALL, path)))
-    long = run(ANYWHERE, WALL, path)
-    assert short.force.dtype == jnp.float32
-    assert short.status.tolist() == long.status.tolist()
-    for name in ("force", "joints", "end_U"):
-        a, b = (np.asarray(getattr(v, name)) for v in (short, long))
-        np.testing.assert_allclose(a, b, atol=1e-3 * np.abs(b).max(), err_msg=name)
-
-
-@pytest.mark.slow
 def test_an_oblique_press_is_that_of_its_direction():
     inward, _, across = np.asarray(local_frame(jnp.asarray(0.4)))
     path = Presses([70.0] * 5, [0.4] * 5, np.tile(3 * inward - 1 * across, (5, 1)))

@@ -108,9 +108,9 @@ def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm(spacings, where, limit)
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("where", ["on vertices", "between"])
-def test_a_finer_mesh_moves_the_force_by_less_than_2_per_cent(spacings, where):
+def test_a_finer_mesh_moves_the_force_by_less_than_2_per_cent(spacings):
     """3 mm deep: of that the facets of the coarse mesh, 0.05 mm, are 1.7 %."""
+    where = "between"
     force = np.hypot(*spacings[where, 3.0][1:])
     assert force.min() > 0.1
     assert (np.ptp(force, axis=0) / force[2]).max() < 0.02

