@@ -166,8 +166,8 @@ def test_cantilever_reference():
 
     Relative per entry, R_1 = -1.8e-12 N included: each reaction keeps its own digits.
     """
-    k, bending = jnp.full(15, 0.1), jnp.full(16, 1.86)
-    h = jnp.asarray([10.0] * 15 + [5.0])
+    k, bending = (jax.device_put(np.full(n, v)) for n, v in ((15, 0.1), (16, 1.86)))
+    h = jax.device_put(np.array([10.0] * 15 + [5.0]))
 
     @jax.jit
     def solved(force):
@@ -459,7 +459,8 @@ def test_contact_at_a_clamp(end):
 def test_units(scale):
     """The same beam with lengths in another unit: stiffness per length rescales, answers too."""
     b = table_1()
-    u = beam_of(b.x * scale, b.length * scale, b.EI * scale**2, b.k / scale)
+    x, length, EI, k = (np.asarray(v) for v in (b.x, b.length, b.EI, b.k))
+    u = beam_of(x * scale, length * scale, EI * scale**2, k / scale)
     one = solver()(b, jnp.asarray(77.0), jnp.asarray(1.0))
     two = solver()(u, jnp.asarray(77.0 * scale), jnp.asarray(1.0))
     np.testing.assert_allclose(one.w * scale, two.w, rtol=1e-10, atol=1e-12 * scale)

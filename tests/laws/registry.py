@@ -219,6 +219,7 @@ ROWS = {
 }  # fmt: skip
 #: Long to compile, of a kind that another row is of too.
 SLOW = (
+    "press_oblique",
     "press_path",
     "skeleton_response",
     "press, softening",
