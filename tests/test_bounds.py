@@ -20,8 +20,6 @@ from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus, ProfileEnd
 
-EPSILON = np.finfo(np.float64).eps
-
 
 def promise_allowed(dtype):
     """Largest KKT residual of a lane that counts as converged.

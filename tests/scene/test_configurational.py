@@ -82,10 +82,8 @@ def test_force_and_moment_are_what_changes_the_stored_energy():
     The depths of the quadrature pass through the smooth touch (1e-3 mm) only with its first points:
     1e-6 N mm, the same at neighbouring poses; differences of fourth order leave 1e-7.
     """
-    shape = "capsule"
-    tool = BALL if shape == "ball" else capsule(3.0, 6.0)
-    scene = scene_of(tool)
-    lower = 0.0 if shape == "ball" else 2.0
+    tool = capsule(3.0, 6.0)
+    scene, lower = scene_of(tool), 2.0
     places = np.array([[73.3, 0.02, 2.0], [81.0, 0.45, 1.2], [44.5, -0.7, 2.6]])
     at = placed(places, OUTER - lower)
     turned = np.stack([turn(v) for v in ([0, 0, 0.05], [0.3, 1.5, 0.1], [0.1, 0.2, -0.1])])

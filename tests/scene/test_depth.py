@@ -149,9 +149,8 @@ def test_the_surface_follows_the_skeleton_not_the_force():
 @pytest.mark.slow
 def test_the_energy_by_the_place_is_that_of_the_work():
     """Differences of fourth order of the work over the way, by quadrature in 15 digits."""
-    shear = True
-    material = dataclasses.replace(SOFT, GA_L=jnp.array(9.0)) if shear else SOFT
-    options = Options(skeleton="softening", shear=shear, contact="bonded")
+    material = dataclasses.replace(SOFT, GA_L=jnp.array(9.0))
+    options = Options(skeleton="softening", shear=True, contact="bonded")
     s, D = 73.3, 4.0
     path = down([D], s)
     scene = make_scene(TUBE, material, path, effects=BONDED)
@@ -159,7 +158,7 @@ def test_the_energy_by_the_place_is_that_of_the_work():
     out = run(scene, material, path)
     x = np.asarray(TUBE.ring_positions)
     EI, k = [1.86] * (len(x) + 1), [0.1] * len(x)
-    GA = [9.0] * (len(x) + 1) if shear else None
+    GA = [9.0] * (len(x) + 1)
 
     def stored(s):
         c = mp.mpf(str(beam_fem.solve(x, 160.0, EI, k, s, 1.0, GA).w_C))
@@ -208,9 +207,8 @@ def test_closed_loops_of_a_tool_that_wanders_do_no_work():
 @pytest.mark.slow
 def test_steps_of_a_session_are_the_rows_of_simulate():
     """Past the fold too: that row is NaN, the next is as if it had not been."""
-    contact_point = "fixed"
     sharp = dataclasses.replace(SOFT, e_1=jnp.array(0.25), e_2=jnp.array(0.0))  # peak at u = 2
-    effects = dataclasses.replace(BARE, contact_point=contact_point)
+    effects = dataclasses.replace(BARE, contact_point="fixed")
     path = ball([75, 1, 0], [75, -9, 0], 11)
     path = Poses(path.rotation, jnp.concatenate([path.translation, path.translation[2:3]]))
     path = Poses(jnp.concatenate([path.rotation, path.rotation[:1]]), path.translation)

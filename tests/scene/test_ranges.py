@@ -260,16 +260,15 @@ def test_friction_and_a_seat_that_the_plan_has_not_are_refused():
 @pytest.mark.slow
 def test_rows_that_do_not_press_are_no_contact_wherever_they_are():
     """Behind the ends they were NaN; off the midline OFF_PLAN in a program of one plane."""
-    material, pressed = MATERIAL, [0, 0, 5]
     around = [0.0, 0.5, 2.5]
     normal = np.array([[0, np.cos(v), np.sin(v)] for v in around])
     away = poses([75, 0, 0], [75, 0, 0], 3)
     start = poses([40, 12, 0], [100, 12, 0], 3)
-    scene = make_scene(TUBE, material, start, tool=sphere(1.0), effects=ONE)
-    assert (scene.plan.contact_point, scene.plan.second_plane) == ("per_step", material is MATERIAL)
-    for height, expected in ((14.0, [1, 1, 1]), (12.0, pressed)):
+    scene = make_scene(TUBE, MATERIAL, start, tool=sphere(1.0), effects=ONE)
+    assert (scene.plan.contact_point, scene.plan.second_plane) == ("per_step", True)
+    for height, expected in ((14.0, [1, 1, 1]), (12.0, [0, 0, 5])):
         path = dataclasses.replace(away, translation=jnp.asarray(height * normal + [75, 0, 0]))
-        out = run(scene, material, path)
+        out = run(scene, MATERIAL, path)
         assert out.status.tolist() == expected
         assert height < 14 or (np.asarray(out.force) == 0).all()
 
@@ -463,15 +462,11 @@ def test_a_tool_in_the_lumen_of_a_mesh_has_no_force():
     Over the end it pressed on the face that closes the last patch.
     """
     radius = 150.0
-    mesh = make_tube(TUBE)
-    mesh = mesh if radius is None else bend(mesh, radius)
+    mesh = bend(make_tube(TUBE), radius)
 
     def led(s, height):
-        if radius is None:
-            places = np.stack([s, height, 0 * s], 1)
-        else:
-            centre, frame = on_arc(s, radius)
-            places = centre + height[:, None] * frame[:, :, 1]
+        centre, frame = on_arc(s, radius)
+        places = centre + height[:, None] * frame[:, :, 1]
         return Poses(np.broadcast_to(np.eye(3), (ROWS, 3, 3)), places)
 
     def to(a, b):
@@ -479,7 +474,7 @@ def test_a_tool_in_the_lumen_of_a_mesh_has_no_force():
 
     down = led(to(75, 75), to(18.6, 15.0))
     scene = make_scene(TUBE, SPRINGS, down, tool=BALL, mesh=mesh, effects=ONE)
-    assert scene.plan.curved == (radius is not None)
+    assert scene.plan.curved
     pressed = run(scene, SPRINGS, down).status.tolist()
     assert pressed == [PressStatus.NO_CONTACT] * pressed.count(1) + [OK] * pressed.count(OK)
     assert OK in pressed
