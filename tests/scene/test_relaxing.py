@@ -1,6 +1,7 @@
 """Scenes in time: a path and a session against presses in time, energy, refusals, memory."""
 
 import dataclasses
+import functools
 import pickle
 
 import jax
@@ -62,8 +63,7 @@ def steps_of(scene, material):
 
         return jax.lax.scan(move, state, way)
 
-    # Of numbers without a weak type: one program for the first state and for those after it.
-    return lambda state, *way: run(material, jax.tree.map(np.asarray, state), *way)
+    return functools.partial(run, material)
 
 
 @pytest.fixture(scope="module")

@@ -100,6 +100,7 @@ def test_a_scan_is_the_session(rubbed, scan):
         state, found = scan(state, *part)
         same(found, stepped(session, *part), 1e-12)
     same(state, session.state, 1e-12)
+    assert scan._cache_size() == 1  # the first state is of the types of those after it
 
 
 @pytest.mark.slow
