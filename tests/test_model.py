@@ -60,7 +60,7 @@ def test_shapes_dtypes_and_consistency(options):
 
 def test_is_the_rooms_in_order():
     got = pressed(Options(), onset=0.1)
-    g, m, s = table_1(), material(), jnp.asarray(44.0)
+    g, m, s = table_1(), material(), np.asarray(44.0)
 
     @jax.jit
     def by_room(g, m, s, touched):
@@ -69,7 +69,7 @@ def test_is_the_rooms_in_order():
         alone = equilibrium.press_series(touched, c, force_law.Law(m.k_1, m.k_3))
         return alone.force, beam.deflect(b, s, alone.force[4]).w
 
-    force, joints = by_room(g, m, s, jnp.asarray(np.maximum(np.asarray(D) - 0.1, 0)))
+    force, joints = by_room(g, m, s, np.asarray(np.maximum(np.asarray(D) - 0.1, 0)))
     np.testing.assert_allclose(got.force, force, rtol=1e-12)
     np.testing.assert_allclose(got.joints[4], joints, rtol=1e-10, atol=1e-14)
 
@@ -106,10 +106,10 @@ def test_two_material():
     """On a ring the ring's own law, mid-span the ligament's; `k_3` holds on rings if not given."""
     options, g = Options(local="two-material"), table_1()
     m = material(**MORE)
-    on, off = (laws(g, m, jnp.asarray(s), options) for s in (50.0, 55.0))
+    on, off = (laws(g, m, np.asarray(s), options) for s in (50.0, 55.0))
     np.testing.assert_allclose(on[:2], (0.9, 0.05), rtol=1e-14)
     np.testing.assert_allclose(off[:2], (0.3, 0.02), rtol=1e-14)
-    plain = laws(g, material(k_1_ring=0.9), jnp.asarray(50.0), options)
+    plain = laws(g, material(k_1_ring=0.9), np.asarray(50.0), options)
     np.testing.assert_allclose(plain[:2], (0.9, 0.02), rtol=1e-14)
 
 
@@ -117,10 +117,10 @@ def test_two_material():
 def test_two_material_goes_over_within_half_the_closest_spacing(x):
     """Also where the first or last ring is nearer to an end: 3 of 5 mm off, w = (1 - 0.6^2)^3."""
     g, w = Geometry.create(100.0, x), (1 - 0.36) ** 3
-    law = laws(g, material(**MORE), jnp.asarray(x[4] + 3), Options(local="two-material"))
+    law = laws(g, material(**MORE), np.asarray(x[4] + 3), Options(local="two-material"))
     np.testing.assert_allclose(1 / law.k_1, w / 0.9 + (1 - w) / 0.3, rtol=1e-12)
     for end in (0.0, 100.0):  # 2 mm off a ring, where the tube ends
-        law = laws(g, material(**MORE), jnp.asarray(end), Options(local="two-material"))
+        law = laws(g, material(**MORE), np.asarray(end), Options(local="two-material"))
         off = np.abs(x - end).min()
         w_end = (1 - min(off / 5, 1) ** 2) ** 3
         np.testing.assert_allclose(1 / law.k_1, w_end / 0.9 + (1 - w_end) / 0.3, rtol=1e-12)
@@ -129,7 +129,7 @@ def test_two_material_goes_over_within_half_the_closest_spacing(x):
 def test_two_material_single_ring_has_a_transition():
     """With one ring the transition is measured to the ends: finite, not the infinity of no pair."""
     g = Geometry.create(100.0, [30.0])
-    law = laws(g, material(**MORE), jnp.asarray(95.0), Options(local="two-material"))
+    law = laws(g, material(**MORE), np.asarray(95.0), Options(local="two-material"))
     np.testing.assert_allclose(law[:2], (0.3, 0.02))
     assert law.k_5 is None
 
@@ -150,12 +150,12 @@ def test_per_ring_values():
 
 def test_touch_is_smooth_and_local():
     width, d = 0.2, np.linspace(-1, 1, 401)
-    run = jax.jit(indentation, static_argnums=2)
-    y = np.asarray(run(d, jnp.asarray(0.1), Options(onset_width=width)))
+    run = jitted(indentation, static_argnums=2)
+    y = np.asarray(run(d, np.asarray(0.1), Options(onset_width=width)))
     np.testing.assert_array_equal(y[d <= 0.1], 0)
     beyond = d >= 0.1 + width
     np.testing.assert_allclose(y[beyond], d[beyond] - 0.1, rtol=1e-14)
-    bonded = run(d, jnp.asarray(0.1), Options(contact="bonded"))
+    bonded = run(d, np.asarray(0.1), Options(contact="bonded"))
     np.testing.assert_array_equal(bonded, d - 0.1)
 
 
@@ -172,7 +172,7 @@ def test_units(unit):
     h = eqx.tree_at(lengths, g, tuple(v * unit for v in lengths(g)))
     m = material()
     n = Material(m.EI_L * unit**2, m.k_M / unit, m.k_1 / unit, m.k_3 / unit**3)
-    s, d, zero = jnp.asarray(44.0), jnp.asarray(D), jnp.zeros(())
+    s, d, zero = np.asarray(44.0), np.asarray(D), np.zeros(())
     one = run(Options(onset_width=0.0))(g, m, s, d, zero)
     two = run(Options(onset_width=0.0))(h, n, s * unit, d * unit, zero)
     np.testing.assert_allclose(two.force, one.force, rtol=1e-11)
@@ -214,13 +214,13 @@ def test_unilateral_contact_does_not_pull():
 
 def test_a_pull_leaves_the_derivatives_of_the_others():
     """Derivative of the force at 1.9 mm by k_3, beside a row that pulls; by central differences."""
-    at, o = jnp.asarray([1.9, 2.2]), Options()
+    at, o = np.asarray([1.9, 2.2]), Options()
     stiff = {"EI_L": 1e3, "k_M": 10.0}
 
     def first(k_3):
         return pressed(o, displacement=at, k_3=k_3, **stiff).force[0]
 
-    slope = jax.grad(first)(jnp.asarray(-0.075))
+    slope = jax.grad(first)(np.asarray(-0.075))
     step = 1e-6
     difference = (first(-0.075 + step) - first(-0.075 - step)) / (2 * step)
     np.testing.assert_allclose(slope, difference, rtol=1e-7)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jitted import jitted
 
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import (
@@ -152,8 +153,8 @@ def test_normal_on_the_midline_is_press(options):
     depth = np.array([-0.5, 0.0, 0.2, 1.0, 3.0])
     D = depth[:, None] * np.array([0.0, -1.0, 0.0])
     got = pressed(44.0, 0.0, D, options, "mat", dtype="float64", **changes)
-    run = jax.jit(functools.partial(press, options=options), compiler_options=QUICK)
-    s, d = jnp.asarray(44.0, "float64"), jnp.asarray(depth, "float64")
+    run = jitted(functools.partial(press, options=options), compiler_options=QUICK)
+    s, d = np.asarray(44.0, "float64"), np.asarray(depth, "float64")
     one = run(table_1(dtype="float64"), material("float64", **changes), s, d)
     rtol = 100 * np.finfo("float64").eps
 
@@ -171,15 +172,15 @@ def test_normal_on_the_midline_is_press(options):
 
 def test_reciprocity_and_ends():
     """C symmetric and positive; ring ends carry the mat's share, all of the load and no more."""
-    run = jax.jit(functools.partial(skeleton_response), compiler_options=QUICK)
+    run = jitted(functools.partial(skeleton_response), compiler_options=QUICK)
     for phi in (0.0, 0.9, -ALPHA):
-        unit = run(table_1(), material(), jnp.asarray(63.0), jnp.asarray(phi))
+        unit = run(table_1(), material(), np.asarray(63.0), np.asarray(phi))
         C = np.asarray(unit.compliance)
         np.testing.assert_allclose(C, C.T, rtol=1e-14)
         assert np.min(np.linalg.eigvalsh(C)) > 0
         carried = 0.05 * (np.asarray(unit.end_U) + np.asarray(unit.end_V))[:, 1:]
         np.testing.assert_allclose(carried, unit.loads[:, 1:], atol=1e-13)
-    np.testing.assert_allclose(local_frame(jnp.asarray(0.9)), turned(0.9), atol=1e-15)
+    np.testing.assert_allclose(local_frame(np.asarray(0.9)), turned(0.9), atol=1e-15)
 
 
 def test_mat_and_arch():
@@ -187,9 +188,9 @@ def test_mat_and_arch():
     mat, arch = pressed(rings="mat"), pressed(rings="arch")
     np.testing.assert_allclose(mat.loads[..., 1:], 0.1 * mat.joints[..., 1:], atol=1e-14)
     np.testing.assert_array_equal(mat.end_U, mat.joints)
-    ring = Ring(*(jnp.asarray(q) for q in (11.3, ALPHA, 13.0, 0.1, 0.4)))
+    ring = Ring(*(np.asarray(q) for q in (11.3, ALPHA, 13.0, 0.1, 0.4)))
     n = np.array([math.cos(0.4), math.sin(0.4)])
-    k = 1 / (n @ np.asarray(jax.jit(ring_compliance)(ring, jnp.asarray(0.4))[0]) @ n)
+    k = 1 / (n @ np.asarray(jitted(ring_compliance)(ring, np.asarray(0.4))[0]) @ n)
     np.testing.assert_allclose(arch.loads[..., 1:], k * arch.joints[..., 1:], atol=1e-14)
 
 
@@ -297,7 +298,7 @@ def test_a_path_sticks_where_it_touches():
 def test_missing_values_are_named(name, keywords):
     values = {n: VALUES[n] for n in ("EI_L", "k_M", "k_1", "k_3")}
     values |= {n: keywords.pop(n) for n in ("EI_C",) if n in keywords}
-    zero = jnp.zeros(())
+    zero = np.zeros(())
     with pytest.raises(ValueError, match=name):
         jax.eval_shape(
             lambda: press_oblique(
@@ -329,7 +330,7 @@ def test_records_of_another_class_are_named():
 
 def test_unused_effects_are_not_in_the_program():
     """Without stretch, and on the mat, the compiled program has fewer operations."""
-    args = table_1(), material(), jnp.asarray(63.0), jnp.asarray(0.4), jnp.asarray(MOVES)
+    args = table_1(), material(), np.asarray(63.0), np.asarray(0.4), np.asarray(MOVES)
 
     def operations(**keywords):
         options = ObliqueOptions(BONDED, **keywords)
@@ -349,9 +350,9 @@ def _values(v):
 
 # A random combination of all results: one reverse pass instead of one for each (compilation).
 weights = np.random.default_rng(0).normal(size=10_000)
-forward_of = jax.jit(jax.jacfwd(_values), compiler_options=QUICK)
-reverse_of = jax.jit(jax.grad(lambda v, w: jnp.dot(w, _values(v))), compiler_options=QUICK)
-value_of = jax.jit(_values, compiler_options=QUICK)
+forward_of = jitted(jax.jacfwd(_values), compiler_options=QUICK)
+reverse_of = jitted(jax.grad(lambda v, w: jnp.dot(w, _values(v))), compiler_options=QUICK)
+value_of = jitted(_values, compiler_options=QUICK)
 
 
 @pytest.mark.slow

@@ -8,14 +8,15 @@ import mpmath as mp
 import numpy as np
 import pytest
 import scipy.optimize
+from jitted import jitted
 
 from jaxtrachea.mechanics.equilibrium import press_series
 from jaxtrachea.mechanics.force_law import Law, duffing
 from jaxtrachea.mechanics.vector_equilibrium import press_vector, press_vector_total
 from jaxtrachea.status import PressStatus
 
-solve = jax.jit(press_vector)
-lanes = jax.jit(jax.vmap(lambda D, C, a, b: press_vector(D, C, Law(a, b))))
+solve = jitted(press_vector)
+lanes = jitted(jax.vmap(lambda D, C, a, b: press_vector(D, C, Law(a, b))))
 C_FULL = np.array([[3.0, 0.5, 0.2], [0.5, 1.0, 0.1], [0.2, 0.1, 0.3]])
 
 
@@ -141,7 +142,7 @@ def test_no_displacement():
     assert got.status == PressStatus.NO_CONTACT
     wanted = np.linalg.inv(C_FULL + np.eye(3) / 0.3)
     for of in (jax.jacfwd, jax.jacrev):
-        stiffness = np.asarray(jax.jit(of(lambda D: press_vector(D, C, local).force))(zero))
+        stiffness = np.asarray(jitted(of(lambda D: press_vector(D, C, local).force))(zero))
         np.testing.assert_allclose(stiffness, wanted, rtol=200 * np.finfo("float64").eps)
 
 
@@ -161,8 +162,8 @@ def _values(v):
     return jnp.concatenate([got.depth, got.force])
 
 
-forward_of, reverse_of = jax.jit(jax.jacfwd(_values)), jax.jit(jax.jacrev(_values))
-value_of = jax.jit(_values)
+forward_of, reverse_of = jitted(jax.jacfwd(_values)), jitted(jax.jacrev(_values))
+value_of = jitted(_values)
 
 
 @pytest.mark.parametrize("k_3", [0.0, 0.7, -0.01])
@@ -170,7 +171,7 @@ def test_gradients(k_3):
     """Forward = reverse = central differences (these in float64) in a random direction of each."""
     rng = np.random.default_rng(3)
     point = {"D": np.array([0.6, -1.7, 0.4]), "C": C_FULL, "k_1": 0.3, "k_3": k_3}
-    here = {n: jnp.asarray(v, "float64") for n, v in point.items()}
+    here = {n: np.asarray(v, "float64") for n, v in point.items()}
     forward, reverse = forward_of(here), reverse_of(here)
     tolerance = 100 * np.finfo("float64").eps
     for name, v in point.items():
@@ -181,7 +182,7 @@ def test_gradients(k_3):
         up, down = (
             value_of(
                 {
-                    n: jnp.asarray(p, "float64")
+                    n: np.asarray(p, "float64")
                     for n, p in (point | {name: v + e * direction}).items()
                 }
             )
@@ -207,7 +208,7 @@ def test_bad_lanes_stay_alone():
 def test_total():
     """As printed: the law takes all of D; the skeleton may then outrun the tool."""
     D, local = np.array([0.3, -0.4, 0.0]), law(0.2, 0.4)
-    run = jax.jit(press_vector_total)
+    run = jitted(press_vector_total)
     got = run(*cast("float64", D, C_FULL), local)
     np.testing.assert_allclose(got.force, (0.2 + 0.4 * 0.25) * D, rtol=1e-14)
     # The third is 0 by cancellation: to the rounding of what cancels.
