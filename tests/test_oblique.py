@@ -180,7 +180,7 @@ def test_reciprocity_and_ends():
         assert np.min(np.linalg.eigvalsh(C)) > 0
         carried = 0.05 * (np.asarray(unit.end_U) + np.asarray(unit.end_V))[:, 1:]
         np.testing.assert_allclose(carried, unit.loads[:, 1:], atol=1e-13)
-    np.testing.assert_allclose(local_frame(np.asarray(0.9)), turned(0.9), atol=1e-15)
+    np.testing.assert_allclose(local_frame(jnp.asarray(0.9)), turned(0.9), atol=1e-15)
 
 
 def test_mat_and_arch():
@@ -188,7 +188,7 @@ def test_mat_and_arch():
     mat, arch = pressed(rings="mat"), pressed(rings="arch")
     np.testing.assert_allclose(mat.loads[..., 1:], 0.1 * mat.joints[..., 1:], atol=1e-14)
     np.testing.assert_array_equal(mat.end_U, mat.joints)
-    ring = Ring(*(np.asarray(q) for q in (11.3, ALPHA, 13.0, 0.1, 0.4)))
+    ring = Ring(*(jnp.asarray(q) for q in (11.3, ALPHA, 13.0, 0.1, 0.4)))
     n = np.array([math.cos(0.4), math.sin(0.4)])
     k = 1 / (n @ np.asarray(jitted(ring_compliance)(ring, np.asarray(0.4))[0]) @ n)
     np.testing.assert_allclose(arch.loads[..., 1:], k * arch.joints[..., 1:], atol=1e-14)

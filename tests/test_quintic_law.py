@@ -130,10 +130,6 @@ def in_series(v):
     return press_series(v["D"], v["c"], Law(v["k_1"], v["k_3"], v["k_5"]))[:2]
 
 
-def in_total(v):
-    return press_total(v["D"], v["c"], Law(v["k_1"], v["k_3"], v["k_5"]))[:2]
-
-
 def as_vector(v):
     D = v["D"] * jnp.asarray([0.6, -0.7, 0.3])
     return press_vector(D, jnp.asarray(C_FULL) * v["c"], Law(v["k_1"], v["k_3"], v["k_5"]))[:2]
@@ -141,7 +137,7 @@ def as_vector(v):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("press", [in_series, in_total, as_vector])
+@pytest.mark.parametrize("press", [in_series, as_vector])
 @pytest.mark.parametrize("k", LAWS)
 def test_derivatives(k, press):
     """Forward = reverse = central differences, by every input, through `vmap` and `jit`."""

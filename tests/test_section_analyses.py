@@ -20,10 +20,9 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import influence as analysis
 from jaxtrachea.inference.design.candidates import Candidates, candidates_of
-from jaxtrachea.inference.design.choice import gains, next_points
+from jaxtrachea.inference.design.choice import next_points
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import _external, influence
-from jaxtrachea.inference.population import population
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
@@ -162,41 +161,6 @@ def test_joint_fit_is_dense_least_squares():
     np.testing.assert_allclose(result.theta, found.x[[[0, 2], [1, 2]]], atol=1e-6)
     np.testing.assert_allclose(result.uncertainty.se, se[[[0, 2], [1, 2]]], rtol=1e-4)
     np.testing.assert_allclose(np.sum(result.cost), found.cost, rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_population_of_sections_has_the_spread_of_its_specimens():
-    """Hardly any noise: mean and spread are those of the true values, one bed shared or not."""
-    truth, sigma = [31.0, 24.0, 35.0, 28.0], SIGMA / 30
-    parts = [measured(i, sigma, str(i), EI_C=v) for i, v in enumerate(truth)]
-    curves, logs = sum(parts, []), np.log(truth)
-    for table, joint in (({}, False), ({"bed_n": {"scope": "shared"}}, True)):
-        result = fit(study_of(curves, table, sigma, joint=joint), ONE)
-        assert np.all(result.status == FitStatus.CONVERGED)
-        found = population(result)
-        assert [p.name for p in found.parameters][0] == "EI_C"
-        effects = found.effects
-        np.testing.assert_allclose(effects.mean[0], np.mean(logs), atol=2e-3)
-        np.testing.assert_allclose(effects.sd[0], np.std(logs, ddof=1), rtol=0.02)
-
-
-@pytest.fixture(scope="module")
-def known(result):
-    return situation(result)
-
-
-@pytest.mark.slow
-def test_information_of_a_candidate_is_that_of_differences(known):
-    """Of presses as those measured, of single presses, whose side force counts off the midline."""
-    theta, h = known.theta[0], 1e-4
-    places = np.array(PLACES)
-    candidates = Candidates(places[:, 0], np.full(3, PATH[-1]), places[:, 1])
-    found = gains(known, candidates)[0]
-    step = h * np.eye(len(TRUTH))
-    J = np.stack([(shown(theta + v) - shown(theta - v)) / (2 * h) for v in step])
-    for k, (_, phi) in enumerate(PLACES):
-        rows = J[:, k, : 2 if phi else 1].reshape(len(TRUTH), -1)
-        np.testing.assert_allclose(found[k], rows @ rows.T / SIGMA**2, rtol=1e-5)
 
 
 @pytest.mark.slow

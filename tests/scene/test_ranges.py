@@ -24,14 +24,11 @@ from small_scenes import (
     presses,
 )
 
-from jaxtrachea import Poses, Presses, Session, make_scene, press_oblique, simulate, sweep
-from jaxtrachea.contact.patches import Touch
+from jaxtrachea import Poses, Presses, Session, make_scene, simulate, sweep
 from jaxtrachea.contact.shapes import sphere
-from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.scene.assemble import with_mesh
 from jaxtrachea.scene.build import dropped_effects
 from jaxtrachea.scene.declare import SceneFacts
-from jaxtrachea.scene.lumen import off_the_end
 from jaxtrachea.scene.plan import ValidRange
 from jaxtrachea.scene.ranges import depth_share, lacking, outside_plan
 from jaxtrachea.scene.refusals import status_of, without_negative_values
@@ -73,15 +70,6 @@ def test_a_plan_without_stretch_refuses_a_path_along_the_tube():
     stiff = dataclasses.replace(SPRINGS, EA_L=None)
     assert needing_more(scene, SPRINGS, LED) == [0, 1, 1]
     assert needing_more(wished, SPRINGS, LED) == needing_more(scene, stiff, LED) == [0, 0, 0]
-
-
-@pytest.mark.slow
-def test_what_the_user_left_out_is_solved_without_it():
-    wished = make_scene(TUBE, SPRINGS, OFF, effects=dataclasses.replace(ONE, axial="off"))
-    assert run(wished, SPRINGS, LED).status[2] == OK
-    stiff = dataclasses.replace(SPRINGS, EA_L=None)
-    made = make_scene(TUBE, SPRINGS, OFF, effects=ONE)
-    assert run(made, stiff, LED).status.tolist() == [OK] * 3
 
 
 #: A press at 60 degrees.
@@ -145,16 +133,6 @@ def test_a_plan_without_bending_rings_refuses_a_material_with_them():
     assert out.status.tolist() == [expected, PressStatus.NO_CONTACT, PressStatus.NO_CONTACT]
     assert np.isnan(out.force[0]) == (expected == OFF_PLAN)
     assert out.force[1:].tolist() == [0, 0]
-
-
-@pytest.mark.slow
-def test_a_plan_of_the_midline_bends_its_rings_off_it():
-    """Its rings were springs, and 83 % off at 60 degrees."""
-    options = ObliqueOptions(axial=False)
-    single = jax.jit(lambda D: press_oblique(TUBE, MATERIAL, 75.0, 1.0, D, options).force)
-    made = make_scene(TUBE, MATERIAL, Presses([75.0], [0.0], [[0, -2.0, 0]]), effects=ONE)
-    right = single(ASIDE.displacement[0])
-    np.testing.assert_allclose(run(made, MATERIAL, ASIDE).force[0], right, rtol=1e-12)
 
 
 def test_a_plan_of_a_tolerance_serves_what_it_was_measured_for():
@@ -350,45 +328,6 @@ def test_only_motion_inwards_counts_as_depth(through):
     np.testing.assert_allclose(share, [0, 2 / 12.6, 12.5 / 12.6, 13 / 12.6], rtol=1e-12)
     status = status_of(jnp.zeros(4, jnp.int8), share, None, {})
     assert status.tolist() == [OK, OK, OK, PressStatus.TOO_DEEP]
-
-
-@pytest.mark.slow
-def test_the_face_that_closes_a_tube_is_as_thick_as_the_tube_is_large(through):
-    """It was 1 mm at any size: for R = 0.2 mm all of a tube of 2 mm."""
-    small = dataclasses.replace(TUBE, length=jnp.asarray(2.0))
-    scene = dataclasses.replace(through[0], geometry=small, radius=jnp.asarray(0.22))
-    s, along = jnp.array([0.01, 0.01, 0.5, 1.5, 1.99, -0.1]), jnp.array([-1.0, 0, -1, 1, 1, 0])
-    normal = jnp.stack([along, 1 - jnp.abs(along), 0 * s], 1)
-    no, point, none = jnp.asarray(0.0), jnp.zeros(3), jnp.asarray(0)
-
-    def at(s, n):
-        return Touch(no, point, point, n, s, no, none, no, no, none)
-
-    seen = jax.vmap(at)(s, normal)
-    assert off_the_end(scene, seen).tolist() == [True, False, False, False, True, True]
-
-
-@pytest.mark.slow
-def test_a_tool_drawn_outwards_is_not_too_deep():
-    """Glued and drawn 20 mm: solved; pressed as far: too deep."""
-    out = presses([0, 20.0, 0])
-    effects = dataclasses.replace(ONE, contact="bonded", second_plane="on")
-    scene = make_scene(TUBE, SPRINGS, out, effects=effects)
-    for sign, expected in ((1, OK), (-1, PressStatus.TOO_DEEP)):
-        path = dataclasses.replace(out, displacement=sign * jnp.asarray(out.displacement))
-        found = run(scene, SPRINGS, path)
-        assert found.status.tolist()[1:] == [OK, expected]
-        np.testing.assert_allclose(
-            found.depth_share, [0, 0, 0] if sign > 0 else [0, 10 / 12.6, 20 / 12.6], atol=1e-9
-        )
-
-
-@pytest.mark.slow
-def test_presses_of_their_own_through_the_tube_are_beyond_their_range(through):
-    path = through[1]
-    effects = dataclasses.replace(ONE, contact_point="per_step")
-    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=effects)
-    too_deep(path, run(scene, SPRINGS, path), "each")
 
 
 def test_a_tool_in_the_lumen_has_no_force(through):

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scenes import BALL, ball
 
 from jaxtrachea import EffectOptions, Geometry, PlanError, Presses, make_scene, simulate
 from jaxtrachea._errors import InputError
@@ -24,7 +23,6 @@ pytestmark = pytest.mark.compiling
 
 TUBE = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=11.7)
 WALL = from_wall(TUBE)
-OUTER = float(TUBE.radius + WALL.offset)
 #: Rows every 5 mm, columns every 40 deg: ring ends at 120 deg, and the contacts, are vertices.
 MESH = make_tube(TUBE, around=9, along=32, wall=2 * float(WALL.offset), relief=0.0, flatten=0.0)
 BONDED = EffectOptions(contact="bonded")
@@ -89,27 +87,6 @@ def test_vertices_go_with_tool_and_rings():
     unlike = run(scene, dataclasses.replace(wall, extrapolated=wall.extrapolated + 1), path)
     assert unlike.status[0] == PressStatus.EXTRAPOLATED
     np.testing.assert_array_equal(unlike.vertices, out.vertices)
-
-
-@pytest.mark.slow
-def test_the_midline_has_its_own_program_and_a_tool_its_dent():
-    """A ball, glued where it touches the round wall, which a straight mesh only follows."""
-    path = ball([75, 1, 0], [75, -4, 0], 4, top=OUTER)
-    scene = make_scene(TUBE, WALL, path, tool=BALL, mesh=MESH, effects=ON)
-    without = make_scene(TUBE, WALL, path, tool=BALL, effects=OFF)
-    assert (scene.plan.second_plane, scene.plan.dent) == (False, 16)
-    same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), scene.tube, without.tube)
-    assert jax.tree.all(same)
-    out = run(scene, WALL, path)
-    u = np.asarray(out.vertices) - np.asarray(MESH.vertices)
-    crown, side = vertex(75, 0.0), vertex(75, ANGLE)
-    assert float(out.s[-1]) == pytest.approx(75, abs=0.01)
-    np.testing.assert_allclose(u[:, crown, 1], out.displacement[:, 1], atol=2e-3)
-    np.testing.assert_allclose(u[:, side], u[:, vertex(75, -ANGLE)] * [1, 1, -1], atol=1e-4)
-    # No vertex lies in the ball.
-    centre = np.asarray(path.translation[-1])
-    away = np.linalg.norm(np.asarray(out.vertices[-1]) - centre, axis=1)
-    assert away.min() == pytest.approx(5, abs=0.03)  # the smoothed gap
 
 
 @pytest.mark.slow

@@ -113,23 +113,6 @@ def test_a_scan_is_the_session_to_the_bit(effects, dtype):
 
 
 @pytest.mark.slow
-def test_a_step_by_itself(rubbed):
-    """Outside of `jit`, and with the scene as an argument."""
-    scene, material, session = rubbed
-    way = way_of(4, 1)
-    session.reset()
-    known = stepped(session, *way)
-    state = other = jt.init_state(scene, material)
-    jitted = jax.jit(jt.step)
-    for i in range(4):
-        pose = [v[i] for v in way]
-        state, result = jt.step(scene, material, state, *pose)
-        other, again = jitted(scene, material, other, *pose)
-        for found in (result, again):
-            same(found, jax.tree.map(lambda v, i=i: v[i], known), 1e-12)
-
-
-@pytest.mark.slow
 def test_many_environments(rubbed):
     """Each on a way of its own, with a material of its own, are what they are alone."""
     scene, material, session = rubbed

@@ -22,7 +22,6 @@ from jaxtrachea import (
     PlanError,
     Poses,
     Presses,
-    Session,
     make_scene,
     press,
     simulate,
@@ -296,27 +295,6 @@ def test_a_sweep_by_command_lies_on_the_tube(tmp_path, monkeypatch, capsys):
         s = np.unique(file["s"][:])
     step = (160 - 2 * 2.36) / len(s)
     np.testing.assert_allclose(s, 2.36 + step * (0.5 + np.arange(len(s))))
-
-
-@pytest.mark.slow
-def test_steps_of_a_session_are_the_rows_of_simulate():
-    """Led to an end until a part of the tool is off the tube."""
-    effects = dataclasses.replace(PUNCH, contact_point="per_step")
-    path = ball([14, -2, 0], [1, -2, 0], 27)
-    scene = make_scene(TUBE, DEEP, path, tool=BALL, effects=effects)
-    assert scene.plan.has("width")
-    out = run(scene, DEEP, path)
-    status = np.asarray(out.status).tolist()
-    assert {OK, OFF_TUBE} <= set(status)
-    assert ((np.asarray(status) == OFF_TUBE) == (np.asarray(out.s) < HALF)).all()
-    session = Session(scene, DEEP)
-    for i in range(len(status)):
-        step = session.step(path.rotation[i], path.translation[i])
-        assert int(step.status) == status[i]
-        for name in ("force", "skeleton", "joints"):
-            np.testing.assert_allclose(
-                getattr(step, name), getattr(out, name)[i], rtol=1e-9, atol=1e-12, err_msg=name
-            )
 
 
 @pytest.mark.slow

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from sections_linear import linear_force
 
-from jaxtrachea import fusion
 from jaxtrachea.mechanics import press as mat
 from jaxtrachea.mechanics.sections import press as press_module
 from jaxtrachea.mechanics.sections import system
 from jaxtrachea.mechanics.sections.contact import place_on
-from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
+from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import SectionOptions, build, press_sections
 from jaxtrachea.mechanics.sections.solve import _flat as flat
 from jaxtrachea.mechanics.sections.solve import _newton as newton_step
@@ -280,38 +279,6 @@ def test_an_equilibrium_that_is_no_minimum_is_seen():
 
 
 @pytest.mark.slow
-def test_single_kernels_of_a_step():
-    """Closure and solution, on the midline assembly with elimination; of many lanes none."""
-    midline, kernels = True, 3
-    if fusion._one_kernel_p is None:
-        pytest.skip("this jaxlib makes no single kernels")
-    geometry, material = Geometry.create(30.0, [10.0, 20.0]), SectionMaterial(**VALUES)
-    direction = jnp.asarray([1.0, 0.0])
-    parts = build(
-        geometry, material, jnp.asarray(14.0), jnp.asarray(0.0), direction, midline=midline
-    )
-    z, D = flat(system.at_rest(parts)), jnp.asarray(1.0)
-
-    def marks(step, z):
-        return str(jax.make_jaxpr(step)(z, D, parts)).count("kernel=True")
-
-    one = marks(newton_step, z)
-    lanes = marks(jax.vmap(newton_step, (0, None, None)), jnp.stack([z, z]))
-    assert (one, lanes) == (kernels, 0)
-
-
-@pytest.mark.slow
-def test_float32():
-    """Single precision: 1e-4 of the largest force, rows that it cannot solve are told."""
-    cases = [*WORK, *HARD.values()]
-    for case, half, full in zip(cases, press(cases, dtype="float32"), press(cases), strict=True):
-        assert half.force.dtype == np.float32
-        np.testing.assert_array_equal(half.status, full.status, err_msg=str(case))
-        size = np.abs(full.force).max()
-        np.testing.assert_allclose(half.force, full.force, atol=2e-4 * size, err_msg=str(case))
-
-
-@pytest.mark.slow
 def test_few_and_many_rings():
     """2 and 200 rings: the linear limit, and balance and work at large displacement."""
     count = 200
@@ -333,23 +300,6 @@ def test_few_and_many_rings():
     assert np.all(got.status == PressStatus.OK)
     work = 3 * (WEIGHTS @ inward(got, 0.9)[:-1, 0])
     assert work == pytest.approx(got.energy[-1], rel=1e-8)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_spans_at_the_clamps_have_their_share_of_the_softening():
-    """Of a scalar and of an array; from moduli and thicknesses none, as no clamped end flattens."""
-    geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS)
-    place = tuple(jnp.asarray(v) for v in (30.0, 0.0, [1.0, 0.0]))
-    of_spans = jnp.linspace(0.5, 1.1, 7)
-    share = np.array([0.4, 1, 1, 1, 1, 1, 0.4])
-    for c_W in (jnp.asarray(0.68), of_spans):
-        material = SectionMaterial(**(VALUES | {"c_W": c_W}))
-        parts = build(geometry, material, *place, midline=True)
-        np.testing.assert_allclose(parts.spans.c_W, share * c_W, rtol=1e-15)
-    plain = SectionMaterial(**{k: v for k, v in VALUES.items() if k != "c_end"})
-    np.testing.assert_allclose(build(geometry, plain, *place, midline=True).spans.c_W, 0.68)
-    assert from_wall(geometry).c_end == 0
 
 
 @pytest.mark.slow
