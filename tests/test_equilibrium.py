@@ -61,7 +61,7 @@ def test_series_limits_of_compliance(c):
     D, local = np.asarray([0.1, 2.0]), law(0.4, 0.02)
     got = series(D, scalar(c), local)
     if c < 1e-6:
-        np.testing.assert_allclose(got.force, duffing(D, local), rtol=1e-8)
+        np.testing.assert_allclose(got.force, 0.4 * D + 0.02 * D**3, rtol=1e-8)
     if c > 1e6:
         np.testing.assert_allclose(got.force, D / c, rtol=1e-8)
 

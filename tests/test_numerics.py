@@ -49,10 +49,10 @@ def test_positive_part(width, dtype):
 
 def test_positive_part_is_c2():
     """Value, slope and curvature agree from both sides at both ends of the blend."""
-    w = np.asarray(0.5)
+    w = 0.5
 
     def f(x):
-        return positive_part(x, w)
+        return positive_part(x, jnp.asarray(w))
 
     run = jitted(lambda x: (f(x), jax.grad(f)(x), jax.grad(jax.grad(f))(x)))
     for end in (0.0, 0.5):

@@ -290,7 +290,7 @@ def test_roots_in_a_bracket_are_a_loop_apart():
         end = jnp.full_like(y, 9)
         return Rising(lambda x: (x**3 + x - y, 3 * x * x + 1), jnp.abs, y, -end, end, end > y)
 
-    solve = jitted(jax.vmap(functools.partial(rising_root, problem, steps=4)))
+    solve = jax.jit(jax.vmap(functools.partial(rising_root, problem, steps=4)))
     text = solve.lower(np.ones((8, 100))).compile().as_text()
     parts = dict(re.findall(r"^(ENTRY|%\S+) .*?\{\n(.*?)^\}", text, re.M | re.S))
 
