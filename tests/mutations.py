@@ -98,7 +98,7 @@ ROWS = {
         ("alike-residuals", "fitting/effective.py",
          "return (1 - r) / (1 + r)", "return (1 - r) / (1 + r * r)",
          "test_reports.py::test_independent_residuals_widen_nothing"),
-        ("curve-weights", "fitting/noise.py",
+        ("curve-weights", "fitting/curve_noise.py",
          "for v in (count * sigma**2, count))", "for v in (count * sigma, count))",
          "test_record_faults.py::test_uneven_noise_and_its_weights"),
         ("share-likelihood", "fitting/force_share.py",
@@ -153,7 +153,7 @@ ROWS = {
          "scene/test_session.py::test_a_jump_grasps_anew "
          "scene/test_session.py::test_a_seat_follows_the_tool"),
         ("seat-apart", "scene/anchor.py",
-         "_limit(MAX_MISMATCH * depth, jnp.abs(off[0]))", "_limit(MAX_MISMATCH * depth, off[0])",
+         "limit(MAX_MISMATCH * depth, jnp.abs(off[0]))", "limit(MAX_MISMATCH * depth, off[0])",
          "scene/test_session.py::test_what_gives_way_only_loses_energy"),
         ("moment-of-a-pose", "scene/configurational.py",
          "jnp.cross(path.rotation, poses.rotation, axis=1)",

@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from late import late
 
 from jaxtrachea.surface import regions
 from jaxtrachea.surface.blocks import LEAST, WIDEST, in_blocks, to_blocks, to_vertices
@@ -34,7 +33,7 @@ def grouped(patch, patches):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(("vertices", "patches"), [(1000, 16), (997, 3), (64, 8), (5000, 2)])
+@pytest.mark.parametrize(("vertices", "patches"), [(997, 3), (64, 8)])
 def test_a_block_holds_vertices_of_one_patch(vertices, patches):
     patch = drawn(vertices, patches)
     blocks = grouped(patch, patches)
@@ -65,25 +64,24 @@ def test_few_vertices_stand_alone():
     assert to_blocks(patch, None).shape == (100, 1)
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
-def test_derivatives_of_the_way_back(dtype):
+def test_derivatives_of_the_way_back():
     """Forward and reverse, single and in lanes, against indexing by numpy."""
     blocks = grouped(drawn(300, 5), 5)
     place, shape = np.asarray(blocks.place), blocks.vertex.shape
     draw = np.random.default_rng(2).normal
-    x, dx = (jnp.asarray(draw(size=(2, shape[0], 3, shape[1])), dtype) for _ in range(2))
-    weight = jnp.asarray(draw(size=(2, 300, 3)), dtype)
+    x, dx = (jnp.asarray(draw(size=(2, shape[0], 3, shape[1])), "float64") for _ in range(2))
+    weight = jnp.asarray(draw(size=(2, 300, 3)), "float64")
     of = jax.vmap(lambda v: to_vertices(v, blocks))
 
     def rows(v):
         return np.asarray(v).swapaxes(2, 3).reshape(2, -1, 3)
 
     out, ahead = jax.jit(lambda x, dx: jax.jvp(of, (x,), (dx,)))(x, dx)
-    assert out.dtype == jnp.dtype(dtype)
+    assert out.dtype == jnp.dtype("float64")
     np.testing.assert_array_equal(out, rows(x)[:, place])
     np.testing.assert_array_equal(ahead, rows(dx)[:, place])
     back = jax.jit(jax.grad(lambda x: jnp.sum(of(x) * weight)))(x)
-    expected = np.zeros((2, shape[0] * shape[1], 3), dtype)
+    expected = np.zeros((2, shape[0] * shape[1], 3), "float64")
     expected[:, place] = weight
     np.testing.assert_array_equal(rows(back), expected)
 
@@ -114,7 +112,7 @@ def alone(mesh, geometry):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("method", ["linear", "hermite", "phong"])
+@pytest.mark.parametrize("method", ["hermite", "phong"])
 def test_a_surface_in_blocks_is_that_of_its_vertices(method):
     """Values and gradients; C in mid-patch (a block is split) and on a node."""
     order = np.random.default_rng(3).permutation(len(TUBE.s))

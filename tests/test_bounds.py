@@ -6,7 +6,6 @@ import bounded
 import numpy as np
 import pytest
 import synthetic
-from late import late
 
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
@@ -20,8 +19,6 @@ from jaxtrachea.inference.profile import profiles
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus, ProfileEnd
-
-EPSILON = np.finfo(np.float64).eps
 
 
 def promise_allowed(dtype):
@@ -74,28 +71,26 @@ def check_nothing_lower(study, sigma, solved, dtype):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("dtype", [np.float64, *late(np.float32)])
-def test_random_bounds_against_scipy(dtype):
+def test_random_bounds_against_scipy():
     """Most lanes end on a bound."""
-    study, sigma, solved = check_lanes(60, dtype)
+    study, sigma, solved = check_lanes(60, "float64")
     lanes = study.lanes
     assert np.mean(np.any((solved.theta == lanes.lower) | (solved.theta == lanes.upper), 1)) > 0.7
-    check_nothing_lower(study, sigma, solved, dtype)
+    check_nothing_lower(study, sigma, solved, "float64")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [np.float64, *late(np.float32)])
-def test_1000_random_bounds(dtype):
+def test_1000_random_bounds():
     """From the same starts SciPy and we end in the same minimum, but for 4 % of the lanes."""
-    study, sigma, solved = check_lanes(1000, dtype)
-    cost = check_nothing_lower(study, sigma, solved, dtype)
+    study, sigma, solved = check_lanes(1000, "float64")
+    cost = check_nothing_lower(study, sigma, solved, "float64")
     other = costs_of_scipy_from_the_starts(1000)
     assert np.sum(np.abs(cost / other - 1) > 1e-3) <= 40
 
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("gap", [0.0, 5e-14, 1e-9])
+@pytest.mark.parametrize("gap", [0.0, 5e-14])
 def test_a_start_next_to_a_bound(gap):
     """The free optimum lies beyond: the others must not stay where it has them."""
     study, _ = bounded.random_study(11, 60)
@@ -116,14 +111,7 @@ def test_a_start_next_to_a_bound(gap):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    ("method", "blocks", "count"),
-    [
-        ("lbfgs", 60, 8),
-        pytest.param("lbfgs", 60, 60, marks=pytest.mark.slow),
-        pytest.param("adam", 300, 60, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("method", "blocks", "count"), [("lbfgs", 60, 8), ("adam", 300, 8)])
 def test_first_order_methods_respect_bounds(method, blocks, count):
     study, start = bounded.random_study(11, count)
     sigma, rows = first_sigma(study), np.arange(count)
@@ -168,11 +156,9 @@ def joint_study(seed, specimens=3):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    "seeds", [range(100, 101), pytest.param(range(101, 130), marks=pytest.mark.slow)]
-)
-def test_joint_fits_with_bounds(seeds):
+def test_joint_fits_with_bounds():
     """The dense study's KKT conditions hold at the joint estimate; SciPy finds nothing lower."""
+    seeds = range(100, 108)
     for seed in seeds:
         study = joint_study(seed)
         joint, dense = study(joint=True), study()

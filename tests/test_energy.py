@@ -23,11 +23,7 @@ NODES, WEIGHTS = (jnp.asarray(v) for v in np.polynomial.legendre.leggauss(12))
 #: name -> (material, options, rings)
 LEVELS = {
     "springs": (MATERIAL, Options(), "mat"),
-    "arch": (MATERIAL, Options(), "arch"),
-    "arch2": (MATERIAL, Options(), "arch2"),
     "two laws, rings of their own": (RICH, TWO, "arch2"),
-    "shear": (RICH, dataclasses.replace(TWO, shear=True), "arch2"),
-    "total": (RICH, dataclasses.replace(TWO, coupling="total"), "arch2"),
     "softening": (dataclasses.replace(MATERIAL, k_3=jnp.array(-0.004)), Options(), "arch2"),
     "bonded": (RICH, dataclasses.replace(TWO, contact="bonded"), "arch2"),
 }

@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from late import late
+from jitted import jitted
 
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, duffing, fold_depth
 from jaxtrachea.status import PressStatus
 
-DTYPES = ["float64", *late("float32")]
-series, total = jax.jit(press_series), jax.jit(press_total)
+series, total = jitted(press_series), jitted(press_total)
 
 
 def law(k_1, k_3, dtype="float64"):
@@ -37,48 +36,46 @@ def exact_depth(D, c, k_1, k_3):
         return 2 * r * mp.sin(mp.asin(argument) / 3)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("k_3", [0.0, *10.0 ** np.arange(-30, 31, 6), -1e-30, -1e-6, -0.003])
-def test_series_closed_form(k_3, dtype):
+def test_series_closed_form(k_3):
     """60 decades of k_3: a few units in the last place, in depth and force."""
     c, k_1 = 1.7, 0.3
-    D = np.array([-3.0, -0.2, 1e-6, 0.5, 4.0]).astype(dtype)
-    args = [np.asarray(v, dtype) for v in (c, k_1, k_3)]
-    got = series(jnp.asarray(D), scalar(c, dtype), law(k_1, k_3, dtype))
+    D = np.array([-3.0, -0.2, 1e-6, 0.5, 4.0]).astype("float64")
+    args = [np.asarray(v, "float64") for v in (c, k_1, k_3)]
+    got = series(np.asarray(D), scalar(c, "float64"), law(k_1, k_3, "float64"))
     depth = [exact_depth(d, *args) for d in D]
     force = [float(args[1]) * d + float(args[2]) * d**3 for d in depth]
-    assert got.depth.dtype == got.force.dtype == dtype
-    rtol = 30 * np.finfo(dtype).eps
+    assert got.depth.dtype == got.force.dtype == "float64"
+    rtol = 30 * np.finfo("float64").eps
     np.testing.assert_allclose(got.depth, np.array(depth, dtype=float), rtol=rtol)
     np.testing.assert_allclose(got.force, np.array(force, dtype=float), rtol=rtol)
     assert np.all(got.status == PressStatus.OK)
     assert got.status.dtype == jnp.int8
     # Local and global parts add up to the tool's displacement.
-    np.testing.assert_allclose(got.depth + scalar(c, dtype) * got.force, D, rtol=2 * rtol)
+    np.testing.assert_allclose(got.depth + scalar(c, "float64") * got.force, D, rtol=2 * rtol)
 
 
 @pytest.mark.parametrize("c", [0.0, 1e-9, 2.0, 1e9])
 def test_series_limits_of_compliance(c):
     """Rigid skeleton: the law itself. Endlessly soft one: the skeleton alone, D / c."""
-    D, local = jnp.asarray([0.1, 2.0]), law(0.4, 0.02)
+    D, local = np.asarray([0.1, 2.0]), law(0.4, 0.02)
     got = series(D, scalar(c), local)
     if c < 1e-6:
-        np.testing.assert_allclose(got.force, duffing(D, local), rtol=1e-8)
+        np.testing.assert_allclose(got.force, 0.4 * D + 0.02 * D**3, rtol=1e-8)
     if c > 1e6:
         np.testing.assert_allclose(got.force, D / c, rtol=1e-8)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("c", [1e-3, 0.8, 30.0])
-def test_series_fold(c, dtype):
+def test_series_fold(c):
     """The coupled fold: d* = sqrt((1 + c k_1)/(-3 c k_3)), D* = 2/3 (1 + c k_1) d*."""
     k_1, k_3 = 0.5, -0.02
     depth = np.sqrt((1 + c * k_1) / (-3 * c * k_3))
     fold = 2 / 3 * (1 + c * k_1) * depth
     # Near the fold d* - d ~ sqrt(1 - D / D*): rounding of D shows as its square root.
-    slack = 20 * np.finfo(dtype).eps
-    D = jnp.asarray(fold * np.array([1 - slack, 1 + slack, -1 - slack, 3.0, 0.5]), dtype)
-    got = series(D, scalar(c, dtype), law(k_1, k_3, dtype))
+    slack = 20 * np.finfo("float64").eps
+    D = np.asarray(fold * np.array([1 - slack, 1 + slack, -1 - slack, 3.0, 0.5]), "float64")
+    got = series(D, scalar(c, "float64"), law(k_1, k_3, "float64"))
     expected = [PressStatus.OK, *[PressStatus.PAST_FOLD] * 3, PressStatus.OK]
     np.testing.assert_array_equal(got.status, expected)
     np.testing.assert_allclose(got.depth[0], depth, rtol=4 * np.sqrt(2 * slack))
@@ -86,20 +83,19 @@ def test_series_fold(c, dtype):
     assert np.all(np.isnan(got.depth[1:4]))
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_total(dtype):
+def test_total():
     """The law takes the whole displacement; what is left after the skeleton is the local part."""
-    D = jnp.asarray([0.0, 0.5, 2.0, -2.0], dtype)
-    local, c = law(0.3, 0.05, dtype), scalar(1.2, dtype)
+    D = np.asarray([0.0, 0.5, 2.0, -2.0], "float64")
+    local, c = law(0.3, 0.05, "float64"), scalar(1.2, "float64")
     got = total(D, c, local)
-    np.testing.assert_array_equal(got.force, jax.jit(duffing)(D, local))
+    np.testing.assert_array_equal(got.force, jitted(duffing)(D, local))
     np.testing.assert_allclose(got.depth, D - c * got.force, rtol=1e-6)
     np.testing.assert_array_equal(got.status, [PressStatus.NO_CONTACT, *[PressStatus.OK] * 3])
-    assert got.force.dtype == got.depth.dtype == dtype
+    assert got.force.dtype == got.depth.dtype == "float64"
 
 
 def test_total_reports_a_negative_local_part():
-    got = total(jnp.asarray([0.1, 5.0, -5.0]), scalar(2.0), law(0.3, 0.05))
+    got = total(np.asarray([0.1, 5.0, -5.0]), scalar(2.0), law(0.3, 0.05))
     n = PressStatus.NEGATIVE_LOCAL
     np.testing.assert_array_equal(got.status, [PressStatus.OK, n, n])
     assert got.depth[1] < 0 < got.depth[2]
@@ -109,7 +105,7 @@ def test_total_reports_a_negative_local_part():
 def test_total_has_the_fold_of_the_law():
     local = law(0.5, -0.02)
     fold = fold_depth(local)
-    got = total(fold * jnp.asarray([0.999, 1.0, 1.001, -2.0]), scalar(0.1), local)
+    got = total(fold * np.asarray([0.999, 1.0, 1.001, -2.0]), scalar(0.1), local)
     p = PressStatus.PAST_FOLD
     np.testing.assert_array_equal(got.status, [PressStatus.OK, p, p, p])
     assert np.all(np.isnan(got.force[1:]) & np.isnan(got.depth[1:]))
@@ -117,7 +113,7 @@ def test_total_has_the_fold_of_the_law():
 
 @pytest.mark.parametrize("press", [series, total])
 def test_zero_displacement(press):
-    got = press(jnp.zeros(2), scalar(1.0), law(0.3, 0.05))
+    got = press(np.zeros(2), scalar(1.0), law(0.3, 0.05))
     np.testing.assert_array_equal([got.force, got.depth], 0)
     np.testing.assert_array_equal(got.status, PressStatus.NO_CONTACT)
 
@@ -129,7 +125,7 @@ def test_zero_displacement(press):
 )
 def test_non_finite_inputs_are_flagged(c, k_1, D, press):
     """No status OK beside a number that is not one."""
-    got = press(jnp.asarray([D]), scalar(c), law(k_1, 0.05))
+    got = press(np.asarray([D]), scalar(c), law(k_1, 0.05))
     np.testing.assert_array_equal(got.status, PressStatus.NON_FINITE)
 
 
@@ -154,7 +150,7 @@ def test_bad_rows_stay_alone(press):
 @pytest.mark.parametrize("press", [series, total])
 def test_units(press, k_3, unit):
     """Lengths in another unit: depth rescales, force does not."""
-    D = jnp.asarray([0.3, 2.0])
+    D = np.asarray([0.3, 2.0])
     one = press(D, scalar(0.9), law(0.4, k_3))
     two = press(D * unit, scalar(0.9 * unit), law(0.4 / unit, k_3 / unit**3))
     np.testing.assert_allclose(two.depth, one.depth * unit, rtol=1e-13)

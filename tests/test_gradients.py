@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from late import late
 
 from jaxtrachea.mechanics.beam import Beam, contact_compliance, deflect
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
@@ -101,8 +100,8 @@ def deflection(split, form, loaded=False):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("s", [25.3, 5.5, 55.2])
-@pytest.mark.parametrize("k", [1e-9, 1e-3, 0.1, 10.0, 1e12])
+@pytest.mark.parametrize("s", [25.3, 5.5])
+@pytest.mark.parametrize("k", [1e-9, 0.1, 1e12])
 @pytest.mark.parametrize("f", [compliance, compliance_independent])
 def test_compliance(f, k, s):
     check(f, beam_values(s, k), rtol=3e-6)
@@ -112,13 +111,7 @@ def test_compliance(f, k, s):
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     ("form", "split", "shear"),
-    [
-        ("recursion", "continuous", False),
-        ("recursion", "continuous", True),
-        ("recursion", "independent", True),
-        ("reactions", "continuous", True),
-        ("reactions", "independent", False),
-    ],
+    [("recursion", "independent", True), ("reactions", "continuous", True)],
 )
 def test_deflect(form, split, shear):
     more = {"force": 0.4} | ({"GA": np.linspace(1, 2, N + 1)} if shear else {})
@@ -151,20 +144,19 @@ def test_contact_on_a_ring(ring):
         assert np.all((np.abs(q - p) < peak) | (np.abs(q - r) < peak)), name
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 @pytest.mark.parametrize("k", [1e-9, 0.1, 1e12])
 @pytest.mark.parametrize("cut", [False, True])
-def test_finite_at_nasty_positions(cut, k, dtype):
+def test_finite_at_nasty_positions(cut, k):
     """C on rings, at both clamps and beside them; with a span of EI = 1e-9: no NaN, no inf."""
     values = beam_values(0.0, k)
     if cut:
         values["EI"][2] = 1e-9
-    v = jax.tree.map(lambda a: jnp.asarray(a, dtype), values)
-    s = jnp.asarray([0.0, 1e-3, 10.0, 25.0, 50.0, 60.999, 61.0], dtype)
+    v = jax.tree.map(lambda a: jnp.asarray(a, "float64"), values)
+    s = jnp.asarray([0.0, 1e-3, 10.0, 25.0, 50.0, 60.999, 61.0], "float64")
     grads, c = _gradients(v, s)
     assert np.all(np.isfinite(c))
     for leaf in jax.tree.leaves(grads):
-        assert leaf.dtype == dtype
+        assert leaf.dtype == "float64"
         assert np.all(np.isfinite(leaf))
     assert np.all(np.asarray(c)[[0, -1]] == 0)
 
@@ -199,14 +191,13 @@ def test_press_law(f, k_3):
     check(f, {"D": np.array([0.5, -1.5, 3.0]), "c": 0.9, "k_1": 0.4, "k_3": k_3}, rtol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 @pytest.mark.parametrize("k_3", [0.0, 1e-30, 1e30, -0.01])
-def test_press_law_at_zero(k_3, dtype):
+def test_press_law_at_zero(k_3):
     """D = 0: d depth / dD = 1 / (1 + c k_1) whatever k_3, and no other input matters."""
     values = {"D": 0.0, "c": 0.9, "k_1": 0.4, "k_3": k_3}
-    v = {n: jnp.asarray(a, dtype) for n, a in values.items()}
+    v = {n: jnp.asarray(a, "float64") for n, a in values.items()}
     gradient = jax.tree.map(np.asarray, _depth_gradient(v))
-    np.testing.assert_allclose(gradient.pop("D"), 1 / 1.36, rtol=4 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(gradient.pop("D"), 1 / 1.36, rtol=4 * np.finfo("float64").eps)
     assert all(g == 0 for g in gradient.values())
 
 
@@ -264,31 +255,22 @@ def pressing(options):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    "options",
-    [
-        Options(),
-        Options(coupling="total", form="reactions", split="independent"),
-        Options(contact="bonded", local="two-material", shear=True, transition=4.5),
-    ],
-    ids=["default", "paper", "everything"],
-)
-def test_press(options):
+def test_press():
     """The whole pipeline, by every leaf of material and geometry, s_c, displacement and onset."""
+    options = Options(coupling="total", form="reactions", split="independent")
     D = np.array([0.3, 1.1, 2.5])
     values = {"x": RINGS, "length": 61.0, "s": 26.7, "D": D, "onset": 0.1} | MATERIAL
     check(pressing(options), values, rtol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
 @pytest.mark.parametrize("k_3", [0.0, 1e-30, 1e20, -1e-4])
-def test_press_finite_at_zero(k_3, dtype):
+def test_press_finite_at_zero(k_3):
     """Before, at and just after first touch, in both dtypes; k_3 from 0 to huge."""
     D = np.array([-1.0, 0.1, 0.1005, 2.0])
     values = {"x": RINGS, "length": 61.0, "s": 20.0, "D": D, "onset": 0.1} | MATERIAL
-    v = jax.tree.map(lambda a: jnp.asarray(a, dtype), values | {"k_3": k_3})
+    v = jax.tree.map(lambda a: jnp.asarray(a, "float64"), values | {"k_3": k_3})
     for leaf in jax.tree.leaves(_press_gradient(v)):
-        assert leaf.dtype == dtype
+        assert leaf.dtype == "float64"
         assert np.all(np.isfinite(leaf))
 
 

@@ -61,11 +61,10 @@ def solved(name, dtype):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", CASES)
-def test_value_and_gradient(name, dtype):
+def test_value_and_gradient(name):
     """The right status; where it says OK, finite numbers that add up, and a finite gradient."""
-    got, gradient, status = solved(name, dtype)
+    got, gradient, status = solved(name, "float64")
     np.testing.assert_array_equal(got.status[1:], status)
     if status != PressStatus.OK:
         assert np.all(np.isnan(got.force[1:]))
@@ -74,9 +73,7 @@ def test_value_and_gradient(name, dtype):
     assert got.force[0] == 0
     assert all(np.all(np.isfinite(v)) for v in got)
     assert got.force[2] > got.force[1] > 0
-    np.testing.assert_allclose(
-        got.depth + got.skeleton, D, rtol=1e-4 if dtype == "float32" else 1e-10
-    )
+    np.testing.assert_allclose(got.depth + got.skeleton, D, rtol=1e-10)
     assert all(np.isfinite(v) for v in gradient.values())
 
 
@@ -92,13 +89,12 @@ def test_float32_agrees_with_float64(name):
     np.testing.assert_allclose(one.reactions, two.reactions, atol=3e-5 * peak, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
-def test_bad_rows_do_not_touch_their_neighbours(dtype):
+def test_bad_rows_do_not_touch_their_neighbours():
     """NaN and folded specimens in a batch are flagged; the good ones keep every bit."""
     rows = [CASES[n][0] for n in ("plain", "NaN ligament", "on a ring", "past the fold")]
 
     def stack(rows):
-        return {n: jnp.asarray([(BASE | r)[n] for r in rows], dtype) for n in BASE}
+        return {n: jnp.asarray([(BASE | r)[n] for r in rows], "float64") for n in BASE}
 
     run = jax.jit(jax.vmap(lambda v: _value_and_gradient(v, 9)))
     (_, mixed), gradients = run(stack(rows))

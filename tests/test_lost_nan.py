@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from late import late
 
 from jaxtrachea._numerics import largest
 from jaxtrachea.contact.shapes import sphere
@@ -25,8 +24,6 @@ from jaxtrachea.scene import trail
 from jaxtrachea.scene.stage import Poses
 from jaxtrachea.status import FitStatus, PressStatus
 
-DTYPES = ["float64", *late("float32")]
-
 
 @jax.jit
 def computed(x):
@@ -34,12 +31,11 @@ def computed(x):
     return x * 0 / (x * 0)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("shape", [(4096,), (4101,), (512, 9), (64, 130)])
-def test_the_largest_of_many_is_no_number(shape, dtype):
+def test_the_largest_of_many_is_no_number(shape):
     """One computed NaN at each of three places: its row is NaN, and the others are as by numpy."""
-    x = np.random.default_rng(1).normal(size=shape).astype(dtype)
-    nan = np.asarray(computed(jnp.ones((), dtype)))
+    x = np.random.default_rng(1).normal(size=shape).astype("float64")
+    nan = np.asarray(computed(1.0))
     found = jax.jit(largest)
     np.testing.assert_array_equal(found(x), x.max(axis=-1))
     for at in (0, x.size // 2, x.size - 1):
@@ -61,19 +57,20 @@ def test_the_largest_in_one_kernel(lanes):
 
 def test_the_derivative_of_the_largest():
     """Of one entry alone; equal ones share it."""
-    x = jnp.asarray(np.r_[np.zeros(20), 3.0, np.ones(19)])
+    x = np.r_[np.zeros(20), 3.0, np.ones(19)]
     moved = np.random.default_rng(3).normal(size=40)
     assert float(jax.jit(lambda x, t: jax.jvp(largest, (x,), (t,))[1])(x, moved)) == moved[20]
     slope = jax.jit(jax.grad(largest))
     np.testing.assert_array_equal(slope(x), np.arange(40) == 20)
-    assert float(np.sum(slope(jnp.ones(40)))) == pytest.approx(1, abs=1e-15)
+    assert np.asarray(slope(np.ones(40))).sum() == pytest.approx(1, abs=1e-15)
 
 
 def test_a_press_by_what_is_no_number():
     """1,400 presses of three components: each whose way is NaN along x is NON_FINITE, not free."""
     ways, law = np.zeros((1400, 3)), Law(jnp.asarray(1.0), jnp.asarray(1.0))
-    ways[:, 0] = np.where(np.arange(1400) % 2, np.asarray(computed(jnp.ones(()))), 0)
-    found = jax.jit(jax.vmap(lambda D: press_vector(D, jnp.eye(3), law)))(ways)
+    ways[:, 0] = np.where(np.arange(1400) % 2, np.asarray(computed(1.0)), 0)
+    run = jax.jit(jax.vmap(lambda D: press_vector(D, jnp.eye(3), law)))
+    found = jax.device_get(run(ways))
     bad = np.isnan(ways[:, 0])
     np.testing.assert_array_equal(found.status[bad], PressStatus.NON_FINITE)
     np.testing.assert_array_equal(np.isnan(found.force).any(axis=1), bad)
@@ -108,14 +105,14 @@ def test_newtons_method_on_sections_accepts_no_state_that_is_no_number(monkeypat
         places=jnp.stack([rest, rest, rest, rest + 1.5]), steps=jnp.zeros(2, jnp.int32),
         lost=jnp.asarray(False), stable=jnp.asarray(True),
     )  # fmt: skip
-    target = jnp.where(jnp.arange(lanes) % 2 == 1, 1.2, 0.8)
+    target = np.where(np.arange(lanes) % 2 == 1, 1.2, 0.8)
 
     def one(target):
         way = begin._replace(places=begin.places.at[solve.TRIED].set(target))
         return solve._advance(way, target, system).places[solve.AT]
 
     at = jax.jit(jax.vmap(one))(target)
-    np.testing.assert_array_equal(at, jnp.where(target > 1, 0, target))
+    np.testing.assert_array_equal(at, np.where(target > 1, 0, target))
 
 
 class _Lane(NamedTuple):
@@ -146,7 +143,7 @@ def test_a_descent_that_ends_without_derivatives_has_not_converged(monkeypatch, 
     monkeypatch.setattr(descent, "evaluate", evaluate)
     monkeypatch.setattr(descent, "cost", lambda model, theta, *_: jnp.sum(theta**2) / 2 + 1)
     monkeypatch.setattr(descent, "rounding_cost", lambda *_: 0.0)
-    sigma = jnp.arange(600.0) % 3
+    sigma = np.arange(600.0) % 3
     how = descent.Descent("adam", descent.Tolerances(cost=1e-4))
 
     def one(sigma):
@@ -166,7 +163,7 @@ def test_a_vertex_that_is_no_number_scales_no_dent(rows):
     dented = flat - np.stack([0 * x, 0.3 * np.exp(-(x * x + z * z)), 0 * x], axis=1)
     ball, at = sphere(5.0), jnp.asarray([0.0, 4.5, 0.0])  # half a millimetre deep
     bad = np.zeros((225, 3))
-    bad[100] = np.asarray(computed(jnp.ones(())))
+    bad[100] = np.asarray(computed(1.0))
 
     @jax.jit
     def laid(off):
@@ -176,7 +173,7 @@ def test_a_vertex_that_is_no_number_scales_no_dent(rows):
 
         return jax.vmap(one)(jnp.tile(jnp.eye(3), (rows, 1, 1)))
 
-    wanted, found = laid(np.zeros((225, 3))), laid(bad)
+    wanted, found = (np.asarray(laid(v)) for v in (np.zeros((225, 3)), bad))
     assert np.abs(wanted - dented[None]).max() > 0.1  # it has to be scaled
     kept = np.arange(225) != 100
     np.testing.assert_allclose(found[:, kept], wanted[:, kept], atol=1e-12)
@@ -187,6 +184,6 @@ def test_a_vertex_that_is_no_number_scales_no_dent(rows):
 def test_a_sample_without_a_solution_hides_no_undetermined_direction(samples):
     """The slope that a fit could not see is that of the samples that have one."""
     slope = np.ones((2, samples))
-    slope[:, 7] = np.asarray(computed(jnp.ones(())))
+    slope[:, 7] = np.asarray(computed(1.0))
     slack = np.full((samples, 2), 1e-3)
     np.testing.assert_allclose(jax.jit(_unseen)(slope, slack), np.sqrt(2) * 1e-3)

@@ -3,11 +3,11 @@
 import math
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from late import late
 
 from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry, table_1
@@ -49,12 +49,11 @@ def as_arrays(mesh):
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
-def test_default_tube_is_the_papers_size(dtype):
-    mesh = make_tube(table_1(dtype))
+def test_default_tube_is_the_papers_size():
+    mesh = make_tube(table_1("float64"))
     assert mesh.faces.shape == (6856, 3)
     assert mesh.vertices.shape == (3430, 3)
-    assert mesh.vertices.dtype == mesh.phi.dtype == jnp.dtype(dtype)
+    assert mesh.vertices.dtype == mesh.phi.dtype == jnp.dtype("float64")
     assert mesh.faces.dtype == jnp.int32
     vertices, faces = as_arrays(mesh)
     edges, count = edge_counts(faces)
@@ -64,7 +63,7 @@ def test_default_tube_is_the_papers_size(dtype):
     assert outside.is_winding_consistent
     np.testing.assert_allclose(volume(vertices, faces), outside.volume, rtol=1e-5)
     assert outside.volume > 0
-    np.testing.assert_allclose(mesh.straight, vertices, atol=1e-4 if dtype == "float32" else 1e-12)
+    np.testing.assert_allclose(mesh.straight, vertices, atol=1e-12)
 
 
 def test_smooth_tube_is_a_prism():
@@ -82,17 +81,18 @@ def test_smooth_tube_is_a_prism():
 
 
 def test_normals_point_outwards():
-    mesh = make_tube(table_1(), lids=False)
-    radial = jnp.stack([0 * mesh.phi, jnp.cos(mesh.phi), jnp.sin(mesh.phi)], axis=1)
-    assert jnp.min(jnp.sum(mesh.normals * radial, axis=1)) > 0.7
-    np.testing.assert_allclose(jnp.linalg.norm(mesh.normals, axis=1), 1, rtol=1e-12)
+    mesh = jax.device_get(make_tube(table_1(), lids=False))
+    radial = np.stack([0 * mesh.phi, np.cos(mesh.phi), np.sin(mesh.phi)], axis=1)
+    assert np.min(np.sum(mesh.normals * radial, axis=1)) > 0.7
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, rtol=1e-12)
     _, count = edge_counts(np.asarray(mesh.faces))
     assert np.sum(count == 1) == 70  # two open ends
 
 
 def test_rings_stand_out_and_the_back_is_flatter():
     geometry = Geometry.create(50.0, [20.0], radius=10.0)
-    mesh = make_tube(geometry, around=36, along=50, wall=2.0, relief=0.5, flatten=0.2)
+    tube = make_tube(geometry, around=36, along=50, wall=2.0, relief=0.5, flatten=0.2)
+    mesh = jax.device_get(tube)
 
     def at(s, phi):
         return float(mesh.distance[np.argmin(np.abs(mesh.s - s) + np.abs(mesh.phi - phi))])
@@ -138,8 +138,9 @@ def check(found, mesh, geometry, atol=0.35, scale=1.0):
     assert len(got) == len(wanted)
     near = np.array([np.argmin(np.sum((got - p) ** 2, axis=1)) for p in wanted])
     assert np.max(np.abs(got[near] - wanted)) < 1e-3 * scale
-    np.testing.assert_allclose(found.mesh.s[near], mesh.s, atol=0.3)
-    turn = np.asarray(found.mesh.phi[near] - mesh.phi)[np.asarray(mesh.distance) > 1]
+    np.testing.assert_allclose(np.asarray(found.mesh.s)[near], mesh.s, atol=0.3)
+    turn = np.asarray(found.mesh.phi)[near] - np.asarray(mesh.phi)
+    turn = turn[np.asarray(mesh.distance) > 1]
     assert np.max(np.abs(np.angle(np.exp(1j * turn)))) < 0.05
     np.testing.assert_allclose(found.geometry.ring_positions, geometry.ring_positions, atol=atol)
     np.testing.assert_allclose(found.geometry.length, geometry.length, atol=0.2)
@@ -148,8 +149,7 @@ def check(found, mesh, geometry, atol=0.35, scale=1.0):
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
-    ("suffix", "scale", "unit"),
-    [("stl", 1.0, None), ("obj", 0.1, "cm"), ("ply", 1.0, None), ("glb", 1e-3, None)],
+    ("suffix", "scale", "unit"), [("stl", 1.0, None), ("obj", 0.1, "cm"), ("glb", 1e-3, None)]
 )
 def test_round_trip(tmp_path, suffix, scale, unit):
     path = write(tmp_path / f"tube.{suffix}", scale=scale)
@@ -182,7 +182,7 @@ def test_flat_back_is_found_without_rings(tmp_path):
     smooth = make_tube(GEOMETRY, around=48, along=60, relief=0.0, flatten=0.2)
     path = write(tmp_path / "t.stl", smooth)
     found = read_mesh(path, Landmarks(larynx=ROTATION @ X, ring_positions=RINGS))
-    np.testing.assert_allclose(found.rotation @ (ROTATION @ Y), Y, atol=0.06)
+    np.testing.assert_allclose(np.asarray(found.rotation) @ (ROTATION @ Y), Y, atol=0.06)
     np.testing.assert_array_equal(found.geometry.ring_positions, RINGS)
     with pytest.raises(MeshError, match=r"t.stl: found \d rings in the relief .* ring_positions="):
         read_mesh(path, LARYNX)
@@ -206,12 +206,14 @@ def test_curved_double_walled_tube(tmp_path):
     found = read_mesh(path, Landmarks(larynx=ROTATION @ X, anterior=ROTATION @ Y))
     np.testing.assert_allclose(found.geometry.length, 92, atol=0.6)
     np.testing.assert_allclose(found.geometry.ring_positions, RINGS, atol=0.6)
-    mesh = found.mesh
+    mesh, phi = found.mesh, np.asarray(found.mesh.phi)
     assert mesh.frames is not None
+    frames = np.asarray(mesh.frames)
     np.testing.assert_allclose(
-        mesh.frames.mT @ mesh.frames, np.broadcast_to(np.eye(3), mesh.frames.shape), atol=1e-12
+        frames.mT @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-12
     )
-    away = jnp.stack([0 * mesh.phi, jnp.cos(mesh.phi), jnp.sin(mesh.phi)], axis=1)
+    away = np.stack([0 * phi, np.cos(phi), np.sin(phi)], axis=1)
+    moved = jax.jit(place)
 
     def unbent(vertices):
         back = np.asarray(found.origin) + np.asarray(vertices) @ np.asarray(found.rotation)
@@ -221,9 +223,9 @@ def test_curved_double_walled_tube(tmp_path):
     rest = unbent(mesh.vertices)
     inside = (rest[:, 0] > 5) & (rest[:, 0] < 87)
     # 0.02 rad: the tilt of the centreline found, see `check`.
-    outward = unbent(place(mesh, away)) - rest
-    np.testing.assert_allclose(outward[inside], np.asarray(away)[inside], atol=0.05)
-    forward = unbent(place(mesh, jnp.zeros_like(away).at[:, 0].set(1.0))) - rest
+    outward = unbent(moved(mesh, away)) - rest
+    np.testing.assert_allclose(outward[inside], away[inside], atol=0.05)
+    forward = unbent(moved(mesh, np.broadcast_to(X, away.shape))) - rest
     forward[:, 0] *= (150 + rest[:, 1]) / 150
     np.testing.assert_allclose(
         forward[inside], np.broadcast_to(X, forward.shape)[inside], atol=0.05

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from jitted import jitted
 from late import late
 
 from jaxtrachea._numerics import (
@@ -32,7 +33,7 @@ DTYPES = ["float64", *late("float32")]
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("width", [0.0, 1e-3, 2.0])
+@pytest.mark.parametrize("width", [0.0, 1e-3])
 def test_positive_part(width, dtype):
     """Exactly 0 below, exactly x above, rising between, and never above max(x, 0) + nothing."""
     w = jnp.asarray(width, dtype)
@@ -48,12 +49,12 @@ def test_positive_part(width, dtype):
 
 def test_positive_part_is_c2():
     """Value, slope and curvature agree from both sides at both ends of the blend."""
-    w = jnp.asarray(0.5)
+    w = 0.5
 
     def f(x):
-        return positive_part(x, w)
+        return positive_part(x, jnp.asarray(w))
 
-    run = jax.jit(lambda x: (f(x), jax.grad(f)(x), jax.grad(jax.grad(f))(x)))
+    run = jitted(lambda x: (f(x), jax.grad(f)(x), jax.grad(jax.grad(f))(x)))
     for end in (0.0, 0.5):
         left, right = (np.array(run(end + e)) for e in (-1e-9, 1e-9))
         # Third derivative is at most 24 / w^2.
@@ -75,9 +76,9 @@ def test_solve_spd(n, dtype):
     matrix = (root @ root.T) * grade[:, None] * grade
     rhs = rng.normal(size=n) * grade
     expected = np.linalg.solve(matrix, rhs)
-    solve = jax.jit(jax.vmap(solve_spd))
+    solve = jitted(jax.vmap(solve_spd))
     stacked = np.stack([matrix, -matrix])
-    got = solve(jnp.asarray(stacked, dtype), jnp.asarray(np.stack([rhs, rhs]), dtype))
+    got = solve(np.asarray(stacked, dtype), np.asarray(np.stack([rhs, rhs]), dtype))
     assert got.dtype == dtype
     np.testing.assert_allclose(
         got[0], expected, rtol=0, atol=3000 * np.finfo(dtype).eps * abs(expected).max()
@@ -93,8 +94,8 @@ def test_cosine_and_sine(dtype, reach):
     small = 10.0 ** -np.arange(1, 20)
     x = np.concatenate([rng.uniform(-reach, reach, 300), rng.normal(size=300), beside, small])
     x = np.append(x, [0.0, reach, -reach]).astype(dtype)
-    both = jax.jit(cos_sin)
-    got = np.asarray(both(jnp.asarray(x)))
+    both = jitted(cos_sin)
+    got = np.asarray(both(np.asarray(x)))
     assert got.dtype == dtype
     with mp.workdps(40):
         wanted = [[float(f(mp.mpf(float(v)))) for v in x] for f in (mp.cos, mp.sin)]
@@ -103,13 +104,13 @@ def test_cosine_and_sine(dtype, reach):
     np.testing.assert_allclose(
         got[1, sine], np.array(wanted)[1, sine], rtol=3 * np.finfo(dtype).eps
     )
-    assert np.all(np.isnan(both(jnp.asarray([np.nan, np.inf], dtype))))
+    assert np.all(np.isnan(both(np.asarray([np.nan, np.inf], dtype))))
 
 
 def test_cosine_and_sine_have_derivatives():
-    x = jnp.linspace(-9, 9, 41)
+    x = np.linspace(-9, 9, 41)
     for jacobian in (jax.jacfwd, jax.jacrev):
-        c, s = jax.jit(jacobian(cos_sin))(x)
+        c, s = jitted(jacobian(cos_sin))(x)
         np.testing.assert_allclose(np.diagonal(c), -np.sin(x), atol=1e-15)
         np.testing.assert_allclose(np.diagonal(s), np.cos(x), atol=1e-15)
 
@@ -117,7 +118,7 @@ def test_cosine_and_sine_have_derivatives():
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 9, 32, 33, 64, 97, 120, 121, 128, 1000, 1500])
+@pytest.mark.parametrize("n", [1, 3, 9, 33, 121, 1500])
 def test_total_and_largest(n, dtype):
     """Against exact sums, with entries of both signs, in rows, at every way of summing."""
     x = np.random.default_rng(n).normal(size=(2, 3, n)).astype(dtype)
@@ -142,17 +143,17 @@ def test_total_and_largest(n, dtype):
 
 @pytest.mark.parametrize("n", [1, 9, 33, 300])
 def test_every(n):
-    run = jax.jit(every)
+    run = jitted(every)
     assert run(np.ones(n, bool))
     for i in (0, n // 2, n - 1):
-        assert not run(jnp.asarray(np.arange(n) != i))
+        assert not run(np.asarray(np.arange(n) != i))
 
 
 @pytest.mark.parametrize("n", [7, 8, 9, 120, 121, 300])
 @pytest.mark.parametrize("reduced", [total, largest])
 def test_a_reduction_fills_up_no_row(reduced, n):
     """A loop over filled-up rows asks for each entry whether it is one: 1.8 times a contact."""
-    program = jax.make_jaxpr(reduced)(jnp.zeros(n)).jaxpr
+    program = jax.make_jaxpr(reduced)(np.zeros(n)).jaxpr
     assert " pad[" not in str(program)
     assert fits_one_kernel(program)  # no array is empty
 
@@ -165,10 +166,10 @@ def test_first_largest(n, dtype):
     x = np.vstack(
         [draw.normal(size=(4, n)), draw.integers(-3, 0, (4, n)), np.full((1, n), -np.inf)]
     )
-    found, alone = jax.jit(jax.vmap(first_largest))(x.astype(dtype)), jax.jit(first_largest)
+    found, alone = jitted(jax.vmap(first_largest))(x.astype(dtype)), jitted(first_largest)
     np.testing.assert_array_equal(found, x.argmax(axis=1))
     for bad in (np.full(n, np.nan), np.where(np.arange(n) == n // 2, np.nan, x[0])):
-        assert 0 <= int(alone(jnp.asarray(bad, dtype))) < n
+        assert 0 <= int(alone(np.asarray(bad, dtype))) < n
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -178,7 +179,7 @@ def test_first_largest(n, dtype):
 def test_product_is_that_of_matrices(shapes, dtype):
     """Against numpy; derivatives, which are exact, by the product rule; lanes."""
     rng = np.random.default_rng(2)
-    a, b = (jnp.asarray(rng.normal(size=shape), dtype) for shape in shapes)
+    a, b = (np.asarray(rng.normal(size=shape), dtype) for shape in shapes)
     close = functools.partial(np.testing.assert_allclose, rtol=0, atol=20 * epsilon(a.dtype))
     lanes, along = np.stack([a, 2 * a]), float(np.sum(b[0]))
 
@@ -197,8 +198,8 @@ def test_product_is_that_of_matrices(shapes, dtype):
 
 
 def test_product_of_unequal_sizes():
-    a = jnp.arange(12.0).reshape(3, 4)
-    for b in (jnp.ones(3), jnp.ones(5), jnp.ones((3, 2))):
+    a = np.arange(12.0).reshape(3, 4)
+    for b in (np.ones(3), np.ones(5), np.ones((3, 2))):
         with pytest.raises(Exception, match=r"expected 4 rows|Type-check error"):
             product(a, b)
 
@@ -217,7 +218,7 @@ def test_picked_is_the_entry(rows, places, n, dtype):
         slope = jax.grad(lambda v: jnp.sum(picked(v, index)))
         return picked(values, index), slope(values)
 
-    found, slope = both(jnp.asarray(values), jnp.asarray(index))
+    found, slope = both(np.asarray(values), np.asarray(index))
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, values[..., index])
     count = np.bincount(index.ravel(), minlength=n)
@@ -230,7 +231,7 @@ def test_turned_is_the_congruence(shape, dtype):
     rng = np.random.default_rng(4)
     matrices, frame = rng.normal(size=(*shape, 3, 3)), rng.normal(size=(3, 2))
     expected = frame.T @ matrices @ frame
-    found = jax.jit(turned)(jnp.asarray(matrices, dtype), jnp.asarray(frame, dtype))
+    found = jitted(turned)(np.asarray(matrices, dtype), np.asarray(frame, dtype))
     assert found.dtype == dtype
     atol = 32 * epsilon(found.dtype) * np.abs(expected).max()
     np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
@@ -240,7 +241,7 @@ def test_turned_is_the_congruence(shape, dtype):
 def test_lowest_are_those_of_a_sort(count):
     """Of equal ones the first; in lanes too."""
     x = np.random.default_rng(6).integers(0, 12, (3, 40)).astype(float)
-    places, left = jax.jit(jax.vmap(lambda v: lowest(v, count)))(jnp.asarray(x))
+    places, left = jitted(jax.vmap(lambda v: lowest(v, count)))(np.asarray(x))
     expected = np.argsort(x, axis=1, kind="stable")[:, :count]
     np.testing.assert_array_equal(places, expected)
     for kept, taken in zip(left, expected, strict=True):

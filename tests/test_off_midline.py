@@ -33,9 +33,9 @@ def of(rings, fitted):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("rings", ["mat", "arch2"])
-def test_errors_are_the_recorded_ones(rings):
+def test_errors_are_the_recorded_ones():
     """Parameters as recorded, everything else computed: forces, side forces, joints, ends."""
+    rings = "arch2"
     known = of(rings, "midline")
     found = script.summary(rings, "midline", known["parameters"], script.read())
     for one, two in zip(found["off"], known["off"], strict=True):

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
-from late import late
 from scipy.integrate import quad
 from scipy.optimize import least_squares
 
@@ -59,16 +58,18 @@ def test_rounded_corner_is_the_average_of_the_sharp_one():
     np.testing.assert_allclose(np.trapezoid(got, x), 0.5 + 0.005**2 / 12, atol=1e-9)
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
-def test_rounded_corner_differentiates(dtype):
-    x, width = jnp.asarray([-0.31, -0.3, -0.2, 0.0, 0.1, 0.3, 0.5], dtype), jnp.asarray(0.3, dtype)
+def test_rounded_corner_differentiates():
+    x, width = (
+        jnp.asarray([-0.31, -0.3, -0.2, 0.0, 0.1, 0.3, 0.5], "float64"),
+        jnp.asarray(0.3, "float64"),
+    )
     one = jax.jit(jax.vmap(jax.value_and_grad(centred_hinge), (0, None)))
     value, slope = one(x, width)
     assert value.dtype == slope.dtype == x.dtype
     wide, centred = np.asarray(x, float), jax.jit(centred_hinge)
     h, exact = 1e-6, np.asarray(width, float)
     differences = np.asarray(centred(wide + h, exact) - centred(wide - h, exact)) / (2 * h)
-    np.testing.assert_allclose(slope, differences, atol=2e-5 if dtype == "float32" else 1e-8)
+    np.testing.assert_allclose(slope, differences, atol=1e-8)
     by_width = jax.jit(jax.jacfwd(centred_hinge, 1))(wide, exact)
     forth = np.asarray(centred(wide, exact + h) - centred(wide, exact - h)) / (2 * h)
     np.testing.assert_allclose(by_width, forth, atol=1e-8)

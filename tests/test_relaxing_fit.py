@@ -82,10 +82,7 @@ def point_of(study, seed=3):
     return jnp.asarray(guess + 0.2 * np.random.default_rng(seed).normal(size=guess.size))
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["line", "parts", *late("markers", "softening", "bonded", "fung", "parts, bonded")],
-)
+@pytest.mark.parametrize("kind", ["line", "parts", *late("markers", "bonded", "fung")])
 def test_residual_is_that_of_the_press_in_time(kind):
     """In closed form beside `press_in_time` in forward mode, through lift-off."""
     options, marked = KINDS[kind]

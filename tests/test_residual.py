@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
-from late import late
 from scipy.integrate import quad
 
 from jaxtrachea._numerics import epsilon
@@ -32,16 +31,10 @@ SHARED = {"fixed": False, "scope": "shared"}
 CASES = {
     "default": (Options(), False, {}),
     "fixed skeleton": (Options(), False, {n: HELD[n] for n in ("EI_L", "k_M")}),
-    "fixed law": (Options(), True, {n: HELD[n] for n in ("k_1", "k_3")}),
-    "shear": (Options(shear=True), False, {}),
-    "two materials": (Options(local="two-material"), False, {}),
-    "dense": (Options(form="reactions"), False, {}),
     "independent": (Options(split="independent"), True, {}),
-    "markers": (Options(shear=True, local="two-material"), True, {}),
     "quintic law": (Options(local="two-material"), False, {"k_5": {}, "k_5_ring": {}}),
     "softening": (Options(shear=True, skeleton="softening"), True, BOTH),
     "punch": (Options(shear=True, local="two-material", half_width=2.4), True, {}),
-    "total": (Options(coupling="total"), False, {}),
     "total, markers": (Options(coupling="total"), True, {}),
     "onset and offset": (Options(onset_width=0.5), False, BOTH),
     "all": (Options(shear=True, local="two-material"), True, BOTH),
@@ -49,12 +42,7 @@ CASES = {
     "beam of a trial": (Options(), False, {"EI_L": TRIAL, "k_1": SHARED}),
     "several beams": (Options(), False, {"k_1": SHARED, "k_M": FREE | {"scale": "linear"}}),
 }  # fmt: skip
-#: Each takes some seconds of compilation; the others are variations.
-LATER = {"fixed law", "dense", "independent", "total", "several beams", "shear", "two materials"}
-LATER |= {"markers", "onset and offset"}  # parts of "all"
-EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in CASES]
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
-ONE_KERNEL = 'inlineable="false",xla_cpu_small_call="true"'
 
 
 def make_study(name, weighting=Weighting()):
@@ -142,7 +130,7 @@ def _press(options, material, s_c, onset, displacement):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EACH)
+@pytest.mark.parametrize("name", CASES)
 def test_is_model_minus_data(name):
     study = make_study(name)
     for k, curves in enumerate(study.curves):
@@ -169,7 +157,7 @@ def test_is_model_minus_data(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EACH)
+@pytest.mark.parametrize("name", CASES)
 def test_jacobian_is_that_of_the_value(name):
     study = make_study(name)
     for k, curves in enumerate(study.curves):
@@ -206,8 +194,10 @@ def test_lanes_are_as_each_by_itself(subtests):
                             np.testing.assert_allclose(got[k], true, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("loss", ["linear", *late("huber")])
-@pytest.mark.parametrize("name", ["default", *late("beam of a trial", "bonded")])
+@pytest.mark.parametrize(
+    ("name", "loss"),
+    [("default", "linear"), pytest.param("bonded", "huber", marks=pytest.mark.slow)],
+)
 def test_the_pull_ahead_is_the_second_derivative(name, loss):
     """J^T root(weight) r'' along a short step; with an onset its rounded corner takes no part."""
     study = make_study(name, Weighting(loss=loss))
@@ -233,8 +223,8 @@ def test_the_pull_ahead_is_the_second_derivative(name, loss):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["all", "several beams", "total, markers"])
-def test_float32_follows_float64(name):
+def test_float32_follows_float64():
+    name = "all"
     study = make_study(name)
     both = jax.jit(residual, static_argnums=0)
     for k in range(len(study.curves)):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from late import late
+from jitted import jitted
 from scipy.linalg import solve_banded
 
 from jaxtrachea.mechanics.ring import (
@@ -23,13 +23,12 @@ from jaxtrachea.status import RingStatus
 ALPHA = 2 * math.pi / 3
 TABLE_1 = {"radius": 11.3, "half_angle": ALPHA, "EI": 13.0, "k_M": 0.1, "k_t": 0.4}
 ANGLES = (0.0, 0.4, 1.9)
-DTYPES = ["float64", *late("float32")]
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
 
-compliance = jax.jit(ring_compliance, static_argnames="order", compiler_options=QUICK)
-stiffness = jax.jit(support_stiffness, static_argnames="level", compiler_options=QUICK)
-response = jax.jit(respond, compiler_options=QUICK)
-influence = jax.jit(jax.vmap(ring_influence, (None, 0, None)), compiler_options=QUICK)
+compliance = jitted(ring_compliance, static_argnames="order", compiler_options=QUICK)
+stiffness = jitted(support_stiffness, static_argnames="level", compiler_options=QUICK)
+response = jitted(respond, compiler_options=QUICK)
+influence = jitted(jax.vmap(ring_influence, (None, 0, None)), compiler_options=QUICK)
 
 
 def ring_of(dtype="float64", **changes):
@@ -117,7 +116,7 @@ def test_shape_and_ends_against_frame(phi_c):
     """Every point of the ring, and the ends U and V (paper fig. 7c)."""
     ring, load = ring_of(), (0.7, -0.4)
     phi, motion, _ = frame_of(400, phi_c, load)
-    got = influence(ring, jnp.asarray(phi), jnp.asarray(phi_c)) @ jnp.asarray(load)
+    got = influence(ring, phi, jnp.asarray(phi_c)) @ np.array(load)
     np.testing.assert_allclose(got, motion, atol=5e-5 * np.max(np.abs(motion)))
     answer = response(ring, jnp.asarray(phi_c), jnp.asarray(load))
     np.testing.assert_allclose(answer.end_U, got[0], atol=1e-12)
@@ -147,7 +146,7 @@ def test_equilibrium_of_the_ends(phi_c):
 
 def test_crown_press_opens_the_ring():
     """Signs: the crown goes with the load, the ends settle alike and move apart."""
-    got = response(ring_of(), jnp.asarray(0.0), jnp.asarray([-1.0, 0.0]))
+    got = response(ring_of(), jnp.asarray(0.0), np.array([-1.0, 0.0]))
     assert got.joint[0] < 0
     assert got.opening > 0
     np.testing.assert_allclose(got.end_U, got.end_V * np.array([1.0, -1.0]), rtol=1e-13)
@@ -155,18 +154,17 @@ def test_crown_press_opens_the_ring():
 
 
 @pytest.mark.parametrize("EI", [1e12, math.inf])
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_rigid_arch_is_the_mat(EI, dtype):
+def test_rigid_arch_is_the_mat(EI):
     """Crown press: exactly P / k_M, the paper's d_i = P_i / k; a lateral one turns the ring too."""
-    ring = ring_of(dtype, EI=EI)
+    ring = ring_of("float64", EI=EI)
     C = C_of(ring, 0.0)
-    eps = np.finfo(dtype).eps
+    eps = np.finfo("float64").eps
     np.testing.assert_allclose(C[0, 0], 10, rtol=4 * eps + 1e4 / EI)
     b, rise = math.sin(ALPHA), 1 - math.cos(ALPHA)
     np.testing.assert_allclose(C[1, 1], 10 * (1 + (rise / b) ** 2), rtol=8 * eps + 1e4 / EI)
-    e = jnp.asarray([1.0, 0.0], dtype)
+    e = np.array([1.0, 0.0])
     for level in ("mat", "arch"):
-        k, status = stiffness(ring, jnp.asarray(0.0, dtype), e, level=level)
+        k, status = stiffness(ring, jnp.asarray(0.0, "float64"), e, level=level)
         np.testing.assert_allclose(k, 0.1, rtol=8 * eps + 1e4 / EI)
         assert status == RingStatus.OK
 
@@ -178,7 +176,7 @@ def test_limits_of_the_tie():
     np.testing.assert_allclose(chain[-1], chain[-2], rtol=1e-7)
     for soft, stiff in zip(chain, chain[1:], strict=False):
         assert np.min(np.linalg.eigvalsh(soft - stiff)) > -1e-12
-    phi, load = jnp.asarray(0.4), jnp.asarray([1.0, 0.2])
+    phi, load = jnp.asarray(0.4), np.array([1.0, 0.2])
     held = response(ring_of(k_t=math.inf), phi, load)
     assert held.opening == 0
     np.testing.assert_allclose(held.tie, response(ring_of(k_t=1e9), phi, load).tie, rtol=1e-7)
@@ -187,23 +185,22 @@ def test_limits_of_the_tie():
     np.testing.assert_allclose(both, C_of(ring_of(EI=math.inf), 0.4), rtol=1e-14)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_ends_of_the_ring_and_behind(dtype):
+def test_ends_of_the_ring_and_behind():
     """At the ends the load stands on a spring; behind them there is no answer, and it is said."""
-    ring, load = ring_of(dtype), jnp.asarray([1.0, 0.0], dtype)
+    ring, load = ring_of(), np.array([1.0, 0.0])
     end = response(ring, ring.half_angle, load)
     assert end.status == RingStatus.OK
     np.testing.assert_allclose(end.end_V[0], 20, rtol=1e-6)  # all of P on one k_M / 2
     np.testing.assert_allclose(end.end_U[0], 0, atol=1e-5)
     np.testing.assert_allclose(end.joint, end.end_V, atol=2e-5)
-    near = response(ring, ring.half_angle - 1e-5, load)
+    near = response(ring, np.asarray(ring.half_angle) - 1e-5, load)
     np.testing.assert_allclose(near.joint, end.joint, rtol=1e-3, atol=1e-3)
     # One lane behind the gap leaves the others alone.
-    phi = jnp.asarray([0.4, -2.2, math.pi, jnp.nan], dtype)
-    C, status = jax.jit(jax.vmap(ring_compliance, (None, 0)))(ring, phi)
+    phi = np.array([0.4, -2.2, math.pi, np.nan])
+    C, status = jitted(jax.vmap(ring_compliance, (None, 0)))(ring, phi)
     wanted = ["OK", "BEHIND_GAP", "BEHIND_GAP", "NON_FINITE"]
     np.testing.assert_array_equal(status, [RingStatus[name] for name in wanted])
-    np.testing.assert_allclose(C[0], C_of(ring, 0.4), rtol=8 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(C[0], C_of(ring, 0.4), rtol=8 * np.finfo("float64").eps)
     assert np.all(np.isnan(C[1:]))
     behind = response(ring, phi[2], load)
     assert behind.status == RingStatus.BEHIND_GAP
@@ -218,13 +215,11 @@ def test_mirror_and_reciprocity(phi):
     np.testing.assert_allclose(C_of(ring, -phi), C * flip * flip[:, None], rtol=1e-12)
     assert np.min(np.linalg.eigvalsh(C)) > 0
     assert abs(C_of(ring, 0.0)[0, 1]) < 1e-14 * C[0, 0]
-    others = jnp.asarray([-1.3, 0.2, ALPHA])
-    to = influence(ring, others, jnp.asarray(phi))
-    back = jnp.stack([influence(ring, jnp.asarray([phi]), v)[0] for v in others])
+    others = np.array([-1.3, 0.2, ALPHA])
+    to = influence(ring, others, phi)
+    back = np.stack([influence(ring, np.array([phi]), v)[0] for v in others])
     np.testing.assert_allclose(to, back.mT, atol=1e-13 * C.max())
-    np.testing.assert_allclose(
-        influence(ring, jnp.asarray([phi]), jnp.asarray(phi))[0], C, rtol=1e-12
-    )
+    np.testing.assert_allclose(influence(ring, np.array([phi]), phi)[0], C, rtol=1e-12)
 
 
 def test_order():
@@ -258,18 +253,18 @@ def test_float32():
 
 def test_all_rings_of_a_tube():
     """One call for rings that differ in k_M: the single answers."""
-    k_M, base = jnp.asarray([0.05, 0.1, 0.3]), ring_of()
+    k_M, base = np.array([0.05, 0.1, 0.3]), ring_of()
 
     def one_ring(k):
         return Ring(base.radius, base.half_angle, base.EI, k, base.k_t)
 
-    C, _ = jax.jit(jax.vmap(lambda k: ring_compliance(one_ring(k), jnp.asarray(0.4))))(k_M)
+    C, _ = jitted(jax.vmap(lambda k: ring_compliance(one_ring(k), jnp.asarray(0.4))))(k_M)
     for k, one in zip(k_M, C, strict=True):
         np.testing.assert_allclose(one, C_of(ring_of(k_M=k), 0.4), rtol=1e-13)
 
 
 def test_tie_stiffness():
-    got = tie_stiffness(jnp.asarray(2.4), jnp.asarray(11.3), jnp.asarray(ALPHA))
+    got = jax.jit(tie_stiffness)(2.4, 11.3, ALPHA)
     np.testing.assert_allclose(got, 2.4 / (11.3 * math.sqrt(3)), rtol=1e-14)
 
 
@@ -291,7 +286,7 @@ value = jax.jit(_all, compiler_options=QUICK)
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("phi", [0.0, 0.4, -1.9])
+@pytest.mark.parametrize("phi", [0.0, -1.9])
 @pytest.mark.parametrize("changes", [{}, {"k_t": 20.0, "EI": 1e3}, {"k_t": 0.975}])
 def test_gradients(phi, changes):
     """Forward = reverse = central differences in everything; k_t = 0.975 is where k_e = 1."""
@@ -309,10 +304,7 @@ def test_gradients(phi, changes):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    "changes",
-    [{"EI": math.inf}, {"k_t": 0.0}, {"k_t": math.inf}, {"phi": ALPHA}, {"phi": 3.0}],
-)
+@pytest.mark.parametrize("changes", [{"EI": math.inf}, {"k_t": math.inf}, {"phi": ALPHA}])
 def test_gradients_at_the_edges_are_finite(changes):
     point = TABLE_1 | {"phi": 0.4, "at": 0.4, "P_y": 0.7, "P_z": -0.4} | changes
     point = {k: jnp.asarray(v) for k, v in point.items()}

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from jitted import jitted
 from late import late
 
 from jaxtrachea.mechanics.roots import (
@@ -21,7 +22,7 @@ from jaxtrachea.mechanics.roots import (
 )
 
 DTYPES = ["float64", *late("float32")]
-ratio = jax.jit(cubic_ratio)
+ratio = jitted(cubic_ratio)
 
 
 def closed_form(u):
@@ -44,7 +45,7 @@ SOFTENING = -np.concatenate([10.0 ** -np.arange(1, 16), [0.25, 0.5, 0.9, 0.99, 0
 def test_cubic_ratio_closed_form(dtype):
     """60 decades of hardening, and softening up to the fold, to a few units in the last place."""
     u = np.concatenate([MAGNITUDES, SOFTENING, [0.0]]).astype(dtype)
-    got = ratio(jnp.asarray(u))
+    got = ratio(np.asarray(u))
     expected = np.array([closed_form(v) for v in u])
     assert got.dtype == dtype
     # At the fold g changes as sqrt(1 + u): rounding of u is magnified there.
@@ -55,7 +56,7 @@ def test_cubic_ratio_closed_form(dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_cubic_ratio_ends_at_the_fold(dtype):
     eps = np.finfo(dtype).eps
-    u = jnp.asarray([-1 + 4 * eps, -1, -1 - 2 * eps, -50, np.nan], dtype)
+    u = np.asarray([-1 + 4 * eps, -1, -1 - 2 * eps, -50, np.nan], dtype)
     got = np.asarray(ratio(u))
     assert abs(got[0] - 1.5) < 4 * np.sqrt(4 * eps)
     assert np.all(np.isnan(got[1:]))
@@ -79,7 +80,7 @@ def test_cubic_ratio_derivatives(u):
         step = mp.mpf(max(abs(u), 1e-3)) * mp.mpf(10) ** -12
         low, mid, high = (root(mp.mpf(u) + i * step) for i in (-1, 0, 1))
         first, second = float((high - low) / (2 * step)), float((high - 2 * mid + low) / step**2)
-    x = jnp.asarray(u)
+    x = np.asarray(u)
     forward, reverse, *hessians = cubic_derivatives(x)
     np.testing.assert_allclose(forward, first, rtol=1e-12)
     np.testing.assert_allclose(reverse, first, rtol=1e-12)
@@ -89,7 +90,7 @@ def test_cubic_ratio_derivatives(u):
 
 def test_cubic_ratio_maps_row_by_row():
     """A NaN row leaves the bits of its neighbours alone."""
-    run = jax.jit(jax.vmap(cubic_ratio))
+    run = jitted(jax.vmap(cubic_ratio))
     one, two = (np.asarray(run(np.array([0.1, v, -0.5, 1e20]))) for v in (7.0, np.nan))
     keep = np.array([0, 2, 3])
     np.testing.assert_array_equal(one[keep], two[keep])
@@ -129,7 +130,7 @@ PAST += [(1e3, -4e4), (-1e9, 1e9)]
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_quintic_ratio_is_the_first_root(dtype):
     u, v = np.array(PAIRS + PAST).T.astype(dtype)
-    got = np.asarray(jax.jit(quintic_ratio)(jnp.asarray(u), jnp.asarray(v)))
+    got = np.asarray(jitted(quintic_ratio)(np.asarray(u), np.asarray(v)))
     expected, fold = np.array([first_root(a, b) for a, b in zip(u, v, strict=True)]).T
     assert got.dtype == dtype
     assert np.all(np.isnan(expected[len(PAIRS) :]))
@@ -139,7 +140,7 @@ def test_quintic_ratio_is_the_first_root(dtype):
     parts = 1 + np.abs(u) * q * expected + np.abs(v) * q * q * expected
     room = 8 * np.finfo(dtype).eps * parts / (expected * (1 + 3 * u * q + 5 * v * q * q))
     assert np.all((np.abs(got / expected - 1) < room)[good])
-    past = np.asarray(jax.jit(quintic_past_fold)(jnp.asarray(u), jnp.asarray(v)))
+    past = np.asarray(jitted(quintic_past_fold)(np.asarray(u), np.asarray(v)))
     np.testing.assert_array_equal(past, np.isnan(expected))
     assert np.all(expected[good] <= fold[good])
 
@@ -147,7 +148,7 @@ def test_quintic_ratio_is_the_first_root(dtype):
 def test_quintic_ratio_knows_the_cubic():
     """Without the fifth power it is the other closed form, up to its fold."""
     u = np.concatenate([MAGNITUDES[:46], SOFTENING])
-    got = jax.jit(quintic_ratio)(jnp.asarray(u * 4 / 27), jnp.zeros(len(u)))
+    got = jitted(quintic_ratio)(np.asarray(u * 4 / 27), np.zeros(len(u)))
     room = 16 * np.finfo(float).eps / np.sqrt(np.clip(1 + u, 1e-12, 1))
     assert np.all(np.abs(np.asarray(got) / np.array([closed_form(v) for v in u]) - 1) < room)
 
@@ -161,7 +162,7 @@ def test_quintic_ratio_next_to_the_fold(away, dtype):
     size = (f + u * f**3 + v * f**5) * (1 - away)  # g + ... = size, rescaled to 1
     u, v = np.asarray(u * size**2, dtype), np.asarray(v * size**4, dtype)
     expected, _ = first_root(u, v)
-    got = float(jax.jit(quintic_ratio)(jnp.asarray(u), jnp.asarray(v)))
+    got = float(jitted(quintic_ratio)(np.asarray(u), np.asarray(v)))
     if abs(away) > 1e-6:
         assert np.isnan(got) == np.isnan(expected) or abs(away) < 1e2 * np.finfo(dtype).eps
     if np.isfinite(expected) and np.isfinite(got):
@@ -195,7 +196,7 @@ def quintic_derivatives(at):
 @pytest.mark.parametrize(("u", "v"), [(0.0, 0.0), (0.4, 0.7), (-0.3, 0.2), (1e6, 1e9), (-0.1, 0.0)])
 def test_quintic_ratio_derivatives(u, v):
     """First derivatives, forward = reverse, by differences in 60 digits; second ones likewise."""
-    forward, reverse, second = quintic_derivatives(jnp.array([u, v]))
+    forward, reverse, second = quintic_derivatives(np.array([u, v]))
     with mp.workdps(60):
 
         def root(a, b):
@@ -222,7 +223,7 @@ def test_first_positive_root(dtype):
     rows = [(1, -3, 1), (1, -1, 0), (1, 2, -3), (1, -2.5, 1.5), (1, 1, 1), (1, 0, 0), (1, -1, 9)]
     rows += [(0, -1, 0), (1, -1e18, 1e17), (1, 1e18, -1), (1e-9, -1, -1), (2, 0, -8)]
     a, b, e = np.array(rows).T.astype(dtype)
-    got = np.asarray(jax.jit(first_positive_root)(*map(jnp.asarray, (a, b, e))))
+    got = np.asarray(jitted(first_positive_root)(*map(np.asarray, (a, b, e))))
     expected = []
     for row in zip(a, b, e, strict=True):
         with mp.workdps(60):
@@ -245,8 +246,8 @@ def test_rising_root(lanes, dtype):
     The last three starts lie beside the root: free steps find them. The one before has no root in
     its bracket.
     """
-    y = jnp.asarray([-1.4, -0.3, 0.0, 1.0, 1.5, 0.7, 0.6, 0.0, -0.6], dtype)
-    start = jnp.asarray([20.0, -30.0, 40.0, -40.0, -9.0, 5.0, 0.7, 0.1, -0.6], dtype)
+    y = np.asarray([-1.4, -0.3, 0.0, 1.0, 1.5, 0.7, 0.6, 0.0, -0.6], dtype)
+    start = np.asarray([20.0, -30.0, 40.0, -40.0, -9.0, 5.0, 0.7, 0.1, -0.6], dtype)
 
     def problem(y, start):
         low, solvable = jnp.full_like(y, -50), y != jnp.asarray(0.7, dtype)
@@ -257,7 +258,7 @@ def test_rising_root(lanes, dtype):
         )  # fmt: skip
 
     solve = functools.partial(rising_root, problem, steps=4)
-    found = jax.jit(jax.vmap(solve) if lanes else solve)(y, start)
+    found = jitted(jax.vmap(solve) if lanes else solve)(y, start)
     assert found.dtype == jnp.dtype(dtype)
     # An error of one rounding in arctan moves x by 1 + x^2 of it, 35 at most.
     want, rtol = np.tan(np.asarray(y, float)), 50 * np.finfo(dtype).eps
@@ -277,8 +278,8 @@ def test_rising_root_beside_another(dtype):
             start, -end, end, end > 0,
         )  # fmt: skip
 
-    start = jnp.asarray([2.5, 0.5, 7.0, -4.0], dtype)
-    found = jax.jit(functools.partial(rising_root, problem, steps=4))(start)
+    start = np.asarray([2.5, 0.5, 7.0, -4.0], dtype)
+    found = jitted(functools.partial(rising_root, problem, steps=4))(start)
     np.testing.assert_allclose(found, np.pi / 6, rtol=8 * np.finfo(dtype).eps)
 
 
@@ -290,7 +291,7 @@ def test_roots_in_a_bracket_are_a_loop_apart():
         return Rising(lambda x: (x**3 + x - y, 3 * x * x + 1), jnp.abs, y, -end, end, end > y)
 
     solve = jax.jit(jax.vmap(functools.partial(rising_root, problem, steps=4)))
-    text = solve.lower(jnp.ones((8, 100))).compile().as_text()
+    text = solve.lower(np.ones((8, 100))).compile().as_text()
     parts = dict(re.findall(r"^(ENTRY|%\S+) .*?\{\n(.*?)^\}", text, re.M | re.S))
 
     def loops(part):  # XLA of JAX 0.12 wraps a loop in a call

@@ -20,11 +20,9 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import influence as analysis
 from jaxtrachea.inference.design.candidates import Candidates, candidates_of
-from jaxtrachea.inference.design.choice import gains, next_points
-from jaxtrachea.inference.design.identifiability import identifiability
+from jaxtrachea.inference.design.choice import next_points
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import _external, influence
-from jaxtrachea.inference.population import population
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
@@ -144,19 +142,6 @@ def test_profile_is_the_refit_at_every_point(result):
 
 
 @pytest.mark.slow
-def test_profile_of_little_noise_is_that_of_the_covariance():
-    """With a hundredth of the noise the model is straight across the interval."""
-    sigma = SIGMA / 100
-    result = fit(study_of(measured(0, sigma), sigma=sigma), ONE)
-    found = profiles(result, ONE, points=2)
-    half = np.sqrt(CHI2) * result.uncertainty.se[0]
-    np.testing.assert_allclose(np.log(found.upper) - result.theta[0], half, rtol=2e-3)
-    np.testing.assert_allclose(result.theta[0] - np.log(found.lower), half, rtol=2e-3)
-    away = (found.coordinate - result.theta[0][:, None]) / result.uncertainty.se[0][:, None]
-    np.testing.assert_allclose(found.statistic, away**2, rtol=4e-3, atol=1e-9)
-
-
-@pytest.mark.slow
 def test_joint_fit_is_dense_least_squares():
     """Two specimens, one bed: estimates and standard errors of SciPy on all residuals at once."""
     curves = [measured(1), measured(2, specimen="two", EI_C=24.0)]
@@ -179,41 +164,6 @@ def test_joint_fit_is_dense_least_squares():
 
 
 @pytest.mark.slow
-def test_population_of_sections_has_the_spread_of_its_specimens():
-    """Hardly any noise: mean and spread are those of the true values, one bed shared or not."""
-    truth, sigma = [31.0, 24.0, 35.0, 28.0], SIGMA / 30
-    parts = [measured(i, sigma, str(i), EI_C=v) for i, v in enumerate(truth)]
-    curves, logs = sum(parts, []), np.log(truth)
-    for table, joint in (({}, False), ({"bed_n": {"scope": "shared"}}, True)):
-        result = fit(study_of(curves, table, sigma, joint=joint), ONE)
-        assert np.all(result.status == FitStatus.CONVERGED)
-        found = population(result)
-        assert [p.name for p in found.parameters][0] == "EI_C"
-        effects = found.effects
-        np.testing.assert_allclose(effects.mean[0], np.mean(logs), atol=2e-3)
-        np.testing.assert_allclose(effects.sd[0], np.std(logs, ddof=1), rtol=0.02)
-
-
-@pytest.fixture(scope="module")
-def known(result):
-    return situation(result)
-
-
-@pytest.mark.slow
-def test_information_of_a_candidate_is_that_of_differences(known):
-    """Of presses as those measured, of single presses, whose side force counts off the midline."""
-    theta, h = known.theta[0], 1e-4
-    places = np.array(PLACES)
-    candidates = Candidates(places[:, 0], np.full(3, PATH[-1]), places[:, 1])
-    found = gains(known, candidates)[0]
-    step = h * np.eye(len(TRUTH))
-    J = np.stack([(shown(theta + v) - shown(theta - v)) / (2 * h) for v in step])
-    for k, (_, phi) in enumerate(PLACES):
-        rows = J[:, k, : 2 if phi else 1].reshape(len(TRUTH), -1)
-        np.testing.assert_allclose(found[k], rows @ rows.T / SIGMA**2, rtol=1e-5)
-
-
-@pytest.mark.slow
 def test_predicted_error_is_that_of_a_fit_with_the_press_added():
     """The chosen press, measured without noise: the new standard errors are those predicted."""
     curves = measured(0)
@@ -231,20 +181,6 @@ def test_predicted_error_is_that_of_a_fit_with_the_press_added():
     # Bounds count as a prior in the prediction: no more than a thousandth here.
     np.testing.assert_allclose(choice.error[1], after.uncertainty.se[0], rtol=1e-3)
     np.testing.assert_allclose(choice.error[0], result.uncertainty.se[0], rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_candidate_without_equilibrium_tells_nothing(known):
-    """Past what the model presses: zeros, beside another as it is alone; never chosen."""
-    alone = gains(known, Candidates(np.array([15.0]), np.array([3.0])))
-    both = Candidates(np.array([15.0, 15.0]), np.array([3.0, 30.0]))
-    found = gains(known, both)
-    np.testing.assert_array_equal(found[:, 1], 0)
-    np.testing.assert_allclose(found[:, :1], alone)
-    assert np.all(found[:, 0].diagonal(axis1=1, axis2=2) > 0)
-    assert next_points(known, both).chosen.tolist() == [0]
-    chart = identifiability(known, np.array([15.0, 20.0]), 30.0)
-    assert np.all(np.isinf(chart.pairs))
 
 
 def test_angles_of_candidates():

@@ -248,18 +248,6 @@ def test_what_is_not_observed_counts_nothing(evaluated):
     np.testing.assert_allclose(kept.value[:2], before.value[:2], rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_single_precision(evaluated):
-    study, theta, _, r, _ = evaluated
-    both, _ = programs(study.model)
-    got = both(theta.astype(np.float32), lane_of(study, np.float32))
-    assert got.value.dtype == got.jacobian.dtype == np.float32
-    np.testing.assert_allclose(got.value, r.value, atol=2e-3 * float(jnp.max(jnp.abs(r.value))))
-    exact = np.asarray(r.jacobian)
-    largest = np.max(np.abs(exact), axis=(0, 2), keepdims=True)
-    np.testing.assert_allclose(np.asarray(got.jacobian) / largest, exact / largest, atol=1e-2)
-
-
 def pressed(values, place, path=PATH):
     """A curve as `press_sections` shows it, with vectors."""
     s, phi, direction = place

@@ -98,7 +98,7 @@ def test_a_call_without_jit_is_one_program(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.vmap])
+@pytest.mark.parametrize("derivative", [jax.jacrev, jax.vmap])
 def test_derivatives_and_batches_of_a_press_are_compiled_once(derivative):
     """But for the way back over the rings, whose `scan` JAX makes anew each time."""
 

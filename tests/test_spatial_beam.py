@@ -1,7 +1,6 @@
 """Beam in two planes on coupling rings: against an independent 60-digit FEM, then its laws."""
 
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,6 @@ from jaxtrachea.mechanics.spatial_beam import SpatialBeam, contact_compliance, d
 
 # float64: measured 3e-13 (rotations beside a soft span), else 1e-14.
 TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
-DTYPES = list(TOLERANCE)
 N = 15
 EI = np.float32(1.862)
 
@@ -68,13 +66,11 @@ def errors_of(got, exact):
     }
 
 
-STIFFNESS = [1e-9, 1e-3, 0.1, 10.0, 1e6, 1e12]
-#: By the older code generator of the quick tests (conftest.py) 3e-5 for (1e-9, True, "float32").
 AGAINST_FEM = [
-    case
-    if case[2] == "float64" and case[0] in (1e-9, 0.1, 1e12) or case == (0.1, True, "float32")
-    else pytest.param(*case, marks=pytest.mark.slow)
-    for case in itertools.product(STIFFNESS, [False, True], DTYPES)
+    (1e-9, True, "float64"),
+    (0.1, False, "float64"),
+    (0.1, True, "float32"),
+    (1e12, True, "float64"),
 ]
 
 
@@ -114,7 +110,7 @@ def test_against_fem(k, with_load, dtype):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("k", [1e-9, 0.1, 10.0, 1e9])
+@pytest.mark.parametrize("k", [1e-9, 1e9])
 def test_equal_rings_are_two_plane_beams(k):
     """Diagonal and equal ring compliances: each plane is `beam.deflect`."""
     x, length, stiffness = 10.0 * np.arange(1, N + 1), 160.0, np.linspace(1, 3, N + 1)
@@ -155,7 +151,7 @@ def test_planes_of_their_own():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("k", [1e-3, 0.1, 1e5])
+@pytest.mark.parametrize("k", [1e-3, 1e5])
 def test_reciprocity(k):
     """Maxwell-Betti: motion at ring i for a load at C = motion of C for that load at ring i."""
     rng = np.random.default_rng(3)
@@ -187,20 +183,19 @@ def test_energy_and_equilibrium(k):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_compliance_of_many_points(dtype):
+def test_compliance_of_many_points():
     """M positions at once are the single answers; symmetric, positive, 0 on the clamps."""
     t = tube(np.random.default_rng(5), 0.1)
-    b = beam_of(t, dtype)
-    s = jnp.asarray([0.0, 0.5, 10.0, 77.3, 80.0, 159.0, 160.0], dtype)
+    b = beam_of(t, "float64")
+    s = jnp.asarray([0.0, 0.5, 10.0, 77.3, 80.0, 159.0, 160.0], "float64")
     at_once = np.asarray(compliances(b, s))
-    assert at_once.dtype == dtype
+    assert at_once.dtype == "float64"
     np.testing.assert_array_equal(at_once, at_once.mT)
     np.testing.assert_array_equal(at_once[[0, -1]], 0)
     assert np.all(np.linalg.eigvalsh(at_once[1:-1]) > 0)
     for v, C in zip(s[1:-1], at_once[1:-1], strict=True):
-        alone = np.stack([plain(b, v, e).w_C for e in jnp.eye(2, dtype=dtype)], 1)
-        np.testing.assert_allclose(C, alone, atol=20 * np.finfo(dtype).eps * np.max(alone))
+        alone = np.stack([plain(b, v, e).w_C for e in jnp.eye(2, dtype="float64")], 1)
+        np.testing.assert_allclose(C, alone, atol=20 * np.finfo("float64").eps * np.max(alone))
     assert compliances(b, s[2]).shape == (2, 2)
 
 
@@ -224,29 +219,30 @@ def test_smooth_across_a_ring():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_cut_and_rigid_rings(dtype):
+def test_cut_and_rigid_rings():
     """Integrity 0 is a ring that is not there; compliance 0 a ring that does not move."""
     x, length, stiffness, C, _ = tube(np.random.default_rng(7), 0.1)
-    s, force = cast(dtype, 63.0, [1.0, 0.4])
+    s, force = cast("float64", 63.0, [1.0, 0.4])
     cut = np.ones(N)
     cut[5] = 0
     gone = np.delete(stiffness, 5, 0)
-    without = beam_of((np.delete(x, 5), length, gone, np.delete(C, 5, 0)), dtype)
-    b = beam_of((x, length, stiffness, C, None), dtype, cut)
+    without = beam_of((np.delete(x, 5), length, gone, np.delete(C, 5, 0)), "float64")
+    b = beam_of((x, length, stiffness, C, None), "float64", cut)
     got, exact = plain(b, s, force), plain(without, s, force)
-    tolerance = 200 * np.finfo(dtype).eps
+    tolerance = 200 * np.finfo("float64").eps
     np.testing.assert_allclose(got.w_C, exact.w_C, rtol=tolerance)
     np.testing.assert_array_equal(got.reaction[5], 0)
-    half = plain(beam_of((x, length, stiffness, C, None), dtype, np.full(N, 0.5)), s, force)
-    same = plain(beam_of((x, length, stiffness, 2 * C), dtype), s, force)
+    half = plain(beam_of((x, length, stiffness, C, None), "float64", np.full(N, 0.5)), s, force)
+    same = plain(beam_of((x, length, stiffness, 2 * C), "float64"), s, force)
     np.testing.assert_allclose(half.reaction, same.reaction, atol=tolerance)
     C = C.copy()
     C[5] = 0
-    held = plain(beam_of((x, length, stiffness, C), dtype), s, force)
+    held = plain(beam_of((x, length, stiffness, C), "float64"), s, force)
     np.testing.assert_array_equal(held.w[5], 0)
     assert np.all(np.isfinite(held.reaction))
-    at_ring = plain(beam_of((x, length, stiffness, C), dtype), jnp.asarray(60.0, dtype), force)
+    at_ring = plain(
+        beam_of((x, length, stiffness, C), "float64"), jnp.asarray(60.0, "float64"), force
+    )
     np.testing.assert_array_equal(at_ring.w_C, 0)
     np.testing.assert_allclose(at_ring.reaction[5], force, rtol=tolerance)
 
@@ -274,12 +270,12 @@ reverse = jax.jit(jax.jacrev(_flat), compiler_options=QUICK)
 value = jax.jit(_flat, compiler_options=QUICK)
 
 
-@pytest.mark.parametrize("s", [25.3, 3.0])
 @pytest.mark.parametrize("k", [1e-3, 0.1, 1e3])
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_gradients(k, s):
+def test_gradients(k):
     """Forward = reverse = central differences along a random direction of every argument."""
+    s = 25.3
     rng = np.random.default_rng(9)
     n = 5
     x, _, stiffness, C, shear = tube(rng, k, n=n, shear=True)

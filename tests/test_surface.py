@@ -20,7 +20,6 @@ pytestmark = pytest.mark.compiling
 
 ALPHA = 2 * math.pi / 3
 METHODS = ["linear", "hermite", "phong"]
-DTYPES = ["float64", *late("float32")]
 GEOMETRY = table_1()
 TUBE = make_tube(GEOMETRY)
 bind = jax.jit(regions.bind)
@@ -87,16 +86,15 @@ def motion(method, s, phi, phi_c, keys, geometry=GEOMETRY):
 
 
 @pytest.mark.parametrize("phi_c", [-ALPHA, -1.3, 0.0, 0.4, ALPHA - 0.01, ALPHA])
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_weights_are_a_partition_of_unity(phi_c, dtype):
+def test_weights_are_a_partition_of_unity(phi_c):
     def cast(v):
-        return v.astype(dtype) if v.dtype == jnp.float64 else v
+        return v.astype("float64") if v.dtype == jnp.float64 else v
 
-    w = weigh(jax.tree.map(cast, BINDING), jnp.asarray(phi_c, dtype))
-    eps = np.finfo(dtype).eps
+    w = weigh(jax.tree.map(cast, BINDING), jnp.asarray(phi_c, "float64"))
+    eps = np.finfo("float64").eps
     np.testing.assert_allclose(w.U + w.J + w.V, 1, rtol=4 * eps)
     assert min(np.min(w.U), np.min(w.J), np.min(w.V)) >= 0
-    assert w.J.dtype == jnp.dtype(dtype)
+    assert w.J.dtype == jnp.dtype("float64")
 
 
 def test_no_weights_behind_the_ends():
@@ -109,19 +107,20 @@ def test_no_weights_behind_the_ends():
 
 
 @pytest.mark.parametrize("method", ["linear", "hermite"])
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_translation_is_exact(method, dtype):
-    shift, rows = np.asarray([0.3, -1.7, 0.9], dtype), np.ones((15, 1), dtype)
-    still = np.zeros((15, 2), dtype)
+def test_translation_is_exact(method):
+    shift, rows = np.asarray([0.3, -1.7, 0.9], "float64"), np.ones((15, 1), "float64")
+    still = np.zeros((15, 2), "float64")
     keys = clamped(
-        np.asarray(73, dtype), shift, *[rows * shift[None]] * 3, still, still[0],
+        np.asarray(73, "float64"), shift, *[rows * shift[None]] * 3, still, still[0],
         clamps=np.stack([shift, shift]),
     )  # fmt: skip
-    geometry = table_1(dtype)
+    geometry = table_1("float64")
     at = bind(make_tube(geometry), geometry)
-    got = OF[method](at, jnp.asarray(0.4, dtype), keys)
-    assert got.dtype == jnp.dtype(dtype)
-    np.testing.assert_allclose(got, np.broadcast_to(shift, got.shape), rtol=8 * np.finfo(dtype).eps)
+    got = OF[method](at, jnp.asarray(0.4, "float64"), keys)
+    assert got.dtype == jnp.dtype("float64")
+    np.testing.assert_allclose(
+        got, np.broadcast_to(shift, got.shape), rtol=8 * np.finfo("float64").eps
+    )
 
 
 @pytest.mark.parametrize("s_c", [73.0, 70.0, 3.0])
@@ -303,14 +302,13 @@ def test_phong_on_the_back_of_a_flattened_tube():
     np.testing.assert_allclose(motion("phong", 42.0, around, 0.0, keys), wanted, atol=5e-6)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("method", METHODS)
-def test_nothing_moves_nothing(method, dtype):
+def test_nothing_moves_nothing(method):
     """Exactly 0; derivatives there are in `test_gradients`."""
-    keys = random_keys(size=0.0, dtype=dtype)
-    geometry = table_1(dtype)
-    at = bind(points([3.0, 71, 73, 150], [0.4, -3.0, 1, 2.5], dtype=dtype), geometry)
-    np.testing.assert_array_equal(OF[method](at, jnp.asarray(0.4, dtype), keys), 0)
+    keys = random_keys(size=0.0, dtype="float64")
+    geometry = table_1("float64")
+    at = bind(points([3.0, 71, 73, 150], [0.4, -3.0, 1, 2.5], dtype="float64"), geometry)
+    np.testing.assert_array_equal(OF[method](at, jnp.asarray(0.4, "float64"), keys), 0)
 
 
 def test_phong_at_rest_in_float32():
@@ -435,19 +433,18 @@ def dent(count, spacing=1.5, reach=5.0, depth=(0.2, -1.0, 0.3), sag=0.0, dtype="
     return at, wanted, fit(at, wanted, reach)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("reach", [3.0, 7.5])
 @pytest.mark.parametrize("count", [1, 8, 16, 32])
-def test_dent_meets_its_targets(count, reach, dtype):
+def test_dent_meets_its_targets(count, reach):
     """2 to 5 spacings: condition below 1e3, targets to the ridge times the weights."""
-    at, wanted, found = dent(count, reach=reach, dtype=dtype)
+    at, wanted, found = dent(count, reach=reach, dtype="float64")
     np.testing.assert_allclose(at[0], [73, 12 * math.cos(0.4), 12 * math.sin(0.4)], rtol=1e-6)
     np.testing.assert_allclose(np.hypot(at[:, 1], at[:, 2]), 12, rtol=1e-6)
-    matrix = np.asarray(kernel(at, at, np.asarray(reach, dtype)), float)
+    matrix = np.asarray(kernel(at, at, np.asarray(reach, "float64")), float)
     assert np.linalg.cond(matrix) < 1e3
     got = correction(found, at)
-    assert got.dtype == jnp.dtype(dtype)
-    atol = 20 * 16 * count * np.finfo(dtype).eps
+    assert got.dtype == jnp.dtype("float64")
+    atol = 20 * 16 * count * np.finfo("float64").eps
     np.testing.assert_allclose(got, wanted, atol=atol)
     collar = local.pattern(count)[1]
     assert collar.sum() == {1: 0, 8: 7, 16: 9, 32: 15}[count]
@@ -471,28 +468,27 @@ def shuffled(mesh, seed=3):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("order", ["by s", "shuffled"])
-def test_dent_of_the_vertices_near_it_is_that_of_all(order, dtype):
+def test_dent_of_the_vertices_near_it_is_that_of_all(order):
     """Values, and derivatives by s_c and depth; also at both ends of the tube, in a batch."""
-    at = jnp.asarray(TUBE.straight if order == "by s" else shuffled(TUBE), dtype)
-    spacing = jnp.asarray(1.5, dtype)
+    at = jnp.asarray(TUBE.straight if order == "by s" else shuffled(TUBE), "float64")
+    spacing = jnp.asarray(1.5, "float64")
     chosen = local.runs(at[:, 0], spacing)
     assert (chosen.order is None) == (order == "by s")
-    s = jnp.asarray([-2.0, 0.0, 1.0, 73.3, 81.0, 159.0, 160.0, 163.0], dtype)
+    s = jnp.asarray([-2.0, 0.0, 1.0, 73.3, 81.0, 159.0, 160.0, 163.0], "float64")
     for count, most in zip((8, 32), chosen.longest[1::2], strict=True):
 
         def both(s_c, depth, count=count):
-            phi, radius = jnp.asarray(0.4, dtype), jnp.asarray(12.0, dtype)
+            phi, radius = jnp.asarray(0.4, "float64"), jnp.asarray(12.0, "float64")
             where = local.centres(s_c, phi, radius, spacing, count)
-            wanted = local.targets(depth, jnp.full(count, 0.2, dtype))
+            wanted = local.targets(depth, jnp.full(count, 0.2, "float64"))
             found = local.fit(where, wanted, 3 * spacing)
             u = at * depth[None]
             near = local.add_correction(u, found, at, chosen, s_c)
             far = u + local.correction(found, at)
             return jnp.stack([near, far]), jnp.stack([jnp.sum(near**2), jnp.sum(far**2)])
 
-        depth = jnp.asarray([0.2, -1.0, 0.3], dtype)
+        depth = jnp.asarray([0.2, -1.0, 0.3], "float64")
         slopes = jax.jacrev(lambda *x: both(*x)[1], argnums=(0, 1))
 
         def program(s, d, f=both, df=slopes):
@@ -500,21 +496,20 @@ def test_dent_of_the_vertices_near_it_is_that_of_all(order, dtype):
 
         batch = jax.jit(jax.vmap(program, (0, None)), compiler_options=QUICK)
         moved, derivatives = batch(s, depth)
-        assert moved.dtype == jnp.dtype(dtype)
+        assert moved.dtype == jnp.dtype("float64")
         assert most < len(at) / 3
-        ulp = 8 * np.finfo(dtype).eps
+        ulp = 8 * np.finfo("float64").eps
         np.testing.assert_allclose(moved[:, 0], moved[:, 1], rtol=ulp, atol=ulp)
         for slope in derivatives:
             near, far = (np.asarray(slope[:, i]) for i in (0, 1))
-            scale = 4 * count * np.finfo(dtype).eps * np.abs(far).max()
+            scale = 4 * count * np.finfo("float64").eps * np.abs(far).max()
             np.testing.assert_allclose(near, far, rtol=0, atol=scale)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_shares_of_a_way_are_its_targets(dtype):
+def test_shares_of_a_way_are_its_targets():
     """Three columns of weights, and one times the way: values and derivatives, near and of all."""
-    at, count = jnp.asarray(shuffled(TUBE), dtype), 16
-    spacing, radius = jnp.asarray(1.5, dtype), jnp.asarray(12.0, dtype)
+    at, count = jnp.asarray(shuffled(TUBE), "float64"), 16
+    spacing, radius = jnp.asarray(1.5, "float64"), jnp.asarray(12.0, "float64")
     chosen = local.runs(at[:, 0], spacing)
 
     def move(kind, s_c, phi_c, depth, sag, spacing):
@@ -533,16 +528,16 @@ def test_shares_of_a_way_are_its_targets(dtype):
         return jax.jvp(f, x, tangent), jax.vjp(f, *x)[1](cotangent)
 
     for depth in ((0.2, -1.0, 0.3), (0.0, 0.0, 0.0)):
-        s_c, phi_c, depth = (jnp.asarray(v, dtype) for v in (73.3, 0.4, depth))
-        x = s_c, phi_c, depth, jnp.linspace(0, 1.5, count, dtype=dtype), spacing
+        s_c, phi_c, depth = (jnp.asarray(v, "float64") for v in (73.3, 0.4, depth))
+        x = s_c, phi_c, depth, jnp.linspace(0, 1.5, count, dtype="float64"), spacing
         moved = jax.eval_shape(functools.partial(move, "way"), *x)
         given = x, random_like(x, 4), random_like(moved, 5)
-        given = jax.tree.map(lambda v: v.astype(dtype), given)
+        given = jax.tree.map(lambda v: v.astype("float64"), given)
         way, columns = program("way", *given), program("targets", *given)
         for a, b in zip(jax.tree.leaves(way), jax.tree.leaves(columns), strict=True):
-            assert a.dtype == b.dtype == jnp.dtype(dtype)
+            assert a.dtype == b.dtype == jnp.dtype("float64")
             # Rounding only: both solve with the same factors.
-            atol = 64 * np.finfo(dtype).eps * max(np.abs(b).max(), 1)
+            atol = 64 * np.finfo("float64").eps * max(np.abs(b).max(), 1)
             np.testing.assert_allclose(a, b, rtol=0, atol=atol)
 
 

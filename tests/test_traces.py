@@ -408,7 +408,6 @@ sys.exit(main())
     [
         (["fit", "fits/virtual_trachea/fit.toml"], {"_advance", "information", "residual_value"}),
         (["simulate", "configs/cross_sections.toml"], {"simulate"}),
-        (["sweep", "configs/scan.toml"], {"sweep"}),
     ],
     ids=lambda v: Path(v[1]).stem if isinstance(v, list) else "",
 )

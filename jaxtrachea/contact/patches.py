@@ -132,9 +132,13 @@ def straight_patches(borders: ArrayLike, radius: ArrayLike, *, overlap=0.5, dtyp
     centres[:, 0] = (at[:-1] + at[1:]) / 2
     ends, zero = at[[0, -1]], np.zeros(count)
     axes = np.eye(3)[:, None].repeat(2, axis=1)
-    line = Centreline(*(jnp.asarray(v, dtype) for v in (ends, ends[:, None] * axes[0], *axes[:2])))
-    shapes = Shape(jnp.asarray(vertices, dtype), jnp.broadcast_to(r, (count,)))
-    return Patches(shapes, *(jnp.asarray(centres, dtype), line, *[jnp.asarray(zero, dtype)] * 2))
+
+    def put(v):
+        return jax.device_put(np.asarray(v, dtype))  # nothing is compiled
+
+    line = Centreline(*map(put, (ends, ends[:, None] * axes[0], *axes[:2])))
+    radii = jnp.broadcast_to(r, (count,)) if isinstance(r, Tracer) else put(np.full(count, r))
+    return Patches(Shape(put(vertices), radii), put(centres), line, *[put(zero)] * 2)
 
 
 def check_borders(borders) -> np.ndarray:

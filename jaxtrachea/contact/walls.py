@@ -12,6 +12,7 @@ On numbers, once; nothing here is traced.
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -97,7 +98,7 @@ def patches_of(
     cores = np.stack([_filled_up(p[0], count) for p in hulls])
 
     def cast(x):
-        return jnp.asarray(np.asarray(x), jnp.zeros(0, dtype).dtype)
+        return jax.device_put(np.asarray(x, jnp.zeros(0, dtype).dtype))  # nothing is compiled
 
     shapes = Shape(cast(cores), cast([p[1] for p in hulls]))
     middles, lost, filled = (cast([p[i] for p in hulls]) for i in (2, 3, 4))

@@ -264,8 +264,9 @@ def _stiffened(C, root):
 def _eliminate(matrix: Float[Array, "m m"], rhs: Float[Array, "m r"]) -> Float[Array, "m r"]:
     """Solve a symmetric system without eigenvalues below 1, all lanes at once (Gauss and Jordan).
 
-    No pivot is below 1 either, but by rounding. A loop: written out, XLA for CPUs makes one kernel
-    of all steps and computes each anew for the next.
+    No pivot is below 1 either; punches on one place that are too stiff for their digits, where
+    rounding could make it so, are NOT_CONVERGED in `solve`. A loop: written out, XLA for CPUs makes
+    one kernel of all steps and computes each anew for the next.
     """
     m = rhs.shape[0]
     rows = jnp.arange(m)[:, None]
@@ -275,7 +276,6 @@ def _eliminate(matrix: Float[Array, "m m"], rhs: Float[Array, "m r"]) -> Float[A
         row, given = (jax.lax.dynamic_index_in_dim(v, i) for v in (matrix, rhs))
         factor = jax.lax.dynamic_index_in_dim(matrix, i, axis=1)
         own = jax.lax.dynamic_index_in_dim(row, i, axis=1)
-        own = jnp.where(own < 1, 1, own)
         row, given = row / own, given / own
         return (
             jnp.where(rows == i, row, matrix - factor * row),

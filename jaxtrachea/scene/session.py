@@ -258,7 +258,7 @@ class Session:
         """
         with self._lock:
             numbers, scene = np.array(self._program.state), self.scene
-        state = jax.tree.map(jnp.array, self._states.views(numbers))
+        state = jax.device_put(self._states.views(numbers))  # a copy; nothing is compiled
         return dataclasses.replace(state, origin=origin_of(scene))
 
     @state.setter

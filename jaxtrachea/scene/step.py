@@ -277,7 +277,7 @@ def _start(scene: Scene, rest: History | None) -> State:
     seen = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
     no, nowhere = jnp.asarray(False), Instant(path, seen)
     return State(
-        started=no, touching=no, side=jnp.asarray(Side.UNTOLD), last=nowhere,
+        started=no, touching=no, side=jnp.int_(Side.UNTOLD), last=nowhere,
         anchor=anchor_at(scene, nowhere), slip=no_slip(dtype) if scene.plan.friction else None,
         memory=None if rest is None else Memory(rest, jnp.zeros((), dtype), jnp.zeros((), dtype)),
         origin=origin_of(scene),

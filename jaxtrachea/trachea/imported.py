@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -178,9 +179,11 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     fields = (normals, where.s, where.phi, where.distance, frames)
 
     def cast(v):
-        return jnp.asarray(v, dtype)
+        return jax.device_put(np.asarray(v, dtype))  # nothing is compiled
 
-    mesh = Mesh(cast(vertices), jnp.asarray(wall.faces, jnp.int32), *(cast(v) for v in fields))
+    mesh = Mesh(
+        cast(vertices), jax.device_put(np.asarray(wall.faces, np.int32)), *(cast(v) for v in fields)
+    )
     step()
     try:
         geometry = Geometry.create(

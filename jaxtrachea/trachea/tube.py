@@ -2,7 +2,7 @@
 
 import math
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from jaxtrachea._arguments import check_word
@@ -84,8 +84,9 @@ def make_tube(
         faces = np.concatenate([faces, lid[:, ::-1], lid + along * around])
     dtype = geometry.length.dtype
     floats = (vertices, vertex_normals(vertices, faces), s, phi, distance)
-    vertices, normals, s, phi, distance = (jnp.asarray(v, dtype) for v in floats)
-    return Mesh(vertices, jnp.asarray(faces, jnp.int32), normals, s, phi, distance)
+    # Put on the device as they are: `jnp.asarray` would compile a conversion for every shape.
+    vertices, normals, s, phi, distance = (jax.device_put(np.asarray(v, dtype)) for v in floats)
+    return Mesh(vertices, jax.device_put(faces.astype(np.int32)), normals, s, phi, distance)
 
 
 def _rows(geometry: Geometry, length, along):

@@ -200,11 +200,6 @@ ROWS = {
         several(), CONTACTS, {"s": np.array([26.7, 400.0, 20.0])},
         (changed(several(), r"displacement has 2 values; expected shape", D=np.ones(2)),),
     ),
-    "press_contacts, two materials": Row(
-        several(contact="bonded", local="two-material", shear=True, half_width=2.0),
-        CONTACTS | {"GA_L": 1.3, "k_1_ring": 0.9, "s": np.array([26.7, 44.7, 18.3])},
-        {"k_M": -0.1}, (),
-    ),
     "press_oblique": Row(
         _oblique, OBLIQUE, OFF,
         (changed(_oblique, SAYS, **LONG),),
@@ -224,8 +219,8 @@ ROWS = {
 }  # fmt: skip
 #: Long to compile, of a kind that another row is of too.
 SLOW = (
+    "press_oblique",
     "press_path",
-    "press_contacts, two materials",
     "skeleton_response",
     "press, softening",
     "press, two materials",

@@ -1,14 +1,11 @@
 """Bands of predictions: they cover, are those of the text book, and end where knowledge does."""
 
 import dataclasses
-import functools
 import math
 import shutil
 from pathlib import Path
 
 import h5py
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
@@ -21,10 +18,8 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
-from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
-from jaxtrachea.prediction.core import Estimate, predicted
 from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.predict import predict_sources
 from jaxtrachea.prediction.pressed import pressed
@@ -194,25 +189,6 @@ def test_joint_fit_predicts_as_one_dense_lane(tmp_path):
     assert np.allclose(at[0].force, at[1].force, rtol=1e-7)
     assert np.allclose(at[0].se, at[1].se, rtol=1e-5)
     assert np.allclose(at[0].half_width, at[1].half_width)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_core_in_float32(read):
-    """Jitted and batched as the command uses it in float64, which other tests check."""
-    sources = [source_of(read, f"s{i:04d}") for i in range(3)]
-    rows = [np.stack([getattr(s, n) for s in sources]) for n in Estimate._fields]
-    estimate = Estimate(*(jnp.asarray(v, np.float32) for v in rows))
-    place, depth = np.full(3, 61.0, np.float32), np.tile(np.float32([1.0, 4.0]), (3, 1))
-    program = functools.partial(predicted, read.study.model)
-    motion = Motion(jnp.asarray(place), jnp.asarray(depth))
-    batch = jax.jit(jax.vmap(program))(estimate, motion)
-    assert batch.value.force.dtype == batch.se.joints.dtype == np.float32
-    exact = predict_sources(read, sources, [61.0] * 3, [np.array([1.0, 4.0])] * 3)
-    for k, curve in enumerate(exact):
-        assert np.allclose(batch.value.force[k], curve.force, rtol=2e-5)
-        assert np.allclose(batch.se.force[k], curve.se, rtol=2e-3)
-        assert np.allclose(batch.se.joints[k], curve.joints_se, rtol=1e-2, atol=1e-5)
 
 
 @pytest.mark.slow

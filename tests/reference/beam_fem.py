@@ -87,7 +87,7 @@ def solve(x, length, EI, k, s_c, force, GA=None, ring_load=None, *, free_end=Fal
     with exactly(DIGITS, *given) as number:
 
         def exact(values):
-            return [number(v) for v in values]
+            return [number(v) for v in np.asarray(values)]
 
         zero = number(0)
         x, EI, k = exact(x), exact(EI), exact(k)
@@ -141,6 +141,7 @@ def solve_independent(x, length, EI, k, s_c, force, GA=None):
 
     Returns (w_C as sum(share * tip), reactions at all rings).
     """
+    x, EI, k = (np.asarray(v) for v in (x, EI, k))
     with exactly(DIGITS, x, length, EI, k, s_c, force, GA) as number:
         n = sum(1 for position in x if number(position) <= number(s_c))
         a, b = number(s_c), number(length) - number(s_c)

@@ -18,16 +18,14 @@ from stopped import FIT, begun, from_peace, set_failed
 @pytest.mark.parametrize(
     ("code", "every"),
     [
-        pytest.param(errno.ENOSPC, 1, marks=pytest.mark.slow, id="full"),
         pytest.param(errno.ENOSPC, 7, id="full, every 7th"),
-        pytest.param(errno.EROFS, 6, marks=pytest.mark.slow, id="read-only"),
         pytest.param(errno.EROFS, 20, id="read-only, every 20th"),
     ],
 )
 def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code, every):
-    """Each write of a run in turn is the first that fails: one line, exit code 2, what was saved.
+    """Some writes of a run are in turn the first that fails: one line, exit code 2, what was kept.
 
-    With room again the run goes on to the same numbers. By default some of the writes.
+    With room again the run goes on to the same numbers.
     """
     monkeypatch.setattr("jaxtrachea.fitting.fit.fit", from_peace(peace))
     monkeypatch.setattr("jaxtrachea.cli.run.show", lambda *_: None)
@@ -112,7 +110,7 @@ cp -r disk/out done
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("size", ["8k", "32k", "64k", "160k"])
+@pytest.mark.parametrize("size", ["8k", "64k"])
 def test_a_disk_that_is_really_full(peace, study, size):
     """A tiny file system of its own, filled by the run and then enlarged."""
     own = ["unshare", "--user", "--map-root-user", "--mount"]

@@ -34,15 +34,7 @@ def scene_of(tool, radius, gaps=GAPS, x=75.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("tool", "radius"),
-    [
-        (capsule(10.0, 4.0), 4.0),
-        (capsule(150.0, 4.0), 4.0),
-        (capsule(490.0, 4.0), 4.0),
-        (sphere(200.0), 200.0),
-    ],
-)
+@pytest.mark.parametrize(("tool", "radius"), [(capsule(490.0, 4.0), 4.0), (sphere(200.0), 200.0)])
 def test_gaps_do_not_grow_with_the_tool(tool, radius):
     """The smoothing grew with the length: a shaft of 980 mm touched 0.8 mm too early.
 
@@ -87,14 +79,6 @@ def test_shafts_in_all_directions_are_solved():
     found = jax.jit(touch_tube)(scene, Poses(turn[fair], at[fair]))
     np.testing.assert_array_equal(found.status, ContactStatus.OK)
     np.testing.assert_allclose(found.gap, gap[fair], atol=0.12)
-
-
-@pytest.mark.slow
-def test_a_longer_tool_is_another_program():
-    """One with fewer steps would leave some of its contacts unsolved."""
-    scene, _ = scene_of(capsule(40.0, 4.0), 4.0)
-    with pytest.raises(ValueError, match="tool"):
-        with_tool(scene, capsule(60.0, 4.0))
 
 
 def test_a_tool_of_a_plan_of_few_steps_may_change():

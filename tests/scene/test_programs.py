@@ -297,25 +297,6 @@ def test_refusals_cost_no_more_than_counted_on_paper():
 
 
 @pytest.mark.slow
-@pytest.mark.compiling
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_an_unused_effect_adds_none_to_the_compiled_program(name):
-    """After XLA's optimisation, by its own count; which folds the two in orders of their own.
-
-    Counted are the operations before they become machine code, which is not optimised here.
-    """
-    scene, path, hand = program(name)
-
-    def count(f):
-        lowered = jax.jit(f).lower(scene, MATERIAL, path)
-        return lowered.compile({"xla_backend_optimization_level": 0}).cost_analysis()
-
-    mine, minimal = count(simulate), count(hand)
-    assert mine["flops"] <= minimal["flops"]
-    assert mine["transcendentals"] == minimal["transcendentals"]
-
-
-@pytest.mark.slow
 def test_each_effect_that_is_on_costs_operations():
     path = ball([75, 1, 0.5], [77, -2, 1.0])
     optional = {"GA_L": 9.0, "k_A": 0.2, "k_1_ring": 0.6}

@@ -8,14 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scenes import BALL, BARE, MATERIAL, ball
+from small_scenes import BARE
 
 from jaxtrachea import (
     EffectOptions,
     Geometry,
     PlanError,
     Presses,
-    Session,
     make_scene,
     simulate,
     sweep,
@@ -23,8 +22,7 @@ from jaxtrachea import (
 from jaxtrachea._errors import InputError
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.sections.material import from_wall
-from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
-from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.scene.build import ends_not_given, material_of, stage
 from jaxtrachea.scene.declare import SECTIONS, SceneFacts
 from jaxtrachea.scene.rules import make_plan
@@ -85,35 +83,6 @@ def test_rows_are_presses_of_their_own_in_any_order():
 
 
 @pytest.mark.slow
-def test_float32():
-    """Within its roundings of float64: a Newton step leaves some 1e-4 of the force."""
-
-    def single(tree):
-        return jax.tree.map(lambda v: jnp.asarray(v, jnp.float32), tree)
-
-    path = straight([75.0, 70.0, 75.0, 75.0, 22.0], [0.5, 0.0, -0.5, 0.5, 1.2], [4.0, 2, 4, 0, 1])
-    short = run(*(single(v) for v in (ANYWHERE, WALL, path)))
-    long = run(ANYWHERE, WALL, path)
-    assert short.force.dtype == jnp.float32
-    assert short.status.tolist() == long.status.tolist()
-    for name in ("force", "joints", "end_U"):
-        a, b = (np.asarray(getattr(v, name)) for v in (short, long))
-        np.testing.assert_allclose(a, b, atol=1e-3 * np.abs(b).max(), err_msg=name)
-
-
-@pytest.mark.slow
-def test_an_oblique_press_is_that_of_its_direction():
-    inward, _, across = np.asarray(local_frame(jnp.asarray(0.4)))
-    path = Presses([70.0] * 5, [0.4] * 5, np.tile(3 * inward - 1 * across, (5, 1)))
-    out = run(ANYWHERE, WALL, path)
-    one = jax.jit(press_sections)(
-        TUBE, WALL, 70.0, 0.4, jnp.array([0.5, 1.0]) * 10**0.5, jnp.array([3.0, -1.0]) / 10**0.5
-    )
-    np.testing.assert_allclose(out.force[0], one.force[-1], atol=1e-11)
-    np.testing.assert_allclose(out.joints[4], one.joints[-1], atol=1e-11)
-
-
-@pytest.mark.slow
 def test_each_row_has_its_status():
     """Along the tube, off the tube, behind the rings, not finite, too deep; a bad stiffness."""
     path = straight([75, 500, 75, 75, 75], [0.3, 0.3, 3.0, np.nan, 0.3], [1, 1, 1, 1, 14.0])
@@ -147,31 +116,6 @@ def test_against_finite_elements_off_the_midline():
         deep = D >= 0.5
         off = side[deep] / normal[deep] - curve["side_force"][deep] / force[deep]
         assert np.abs(off).max() < 0.08
-
-
-@pytest.mark.slow
-def test_a_tool_presses_as_presses_do():
-    """Led down on the midline, glued where it touches: the program of one plane."""
-    path = ball([75, 1, 0], [75, -3, 0], 4, top=float(TUBE.radius + WALL.offset))
-    scene = make_scene(TUBE, WALL, path, tool=BALL, effects=BONDED)
-    assert (scene.plan.second_plane, scene.plan.level("skeleton")) == (False, "sections")
-    out = run(scene, WALL, path)
-    assert out.status.tolist() == [PressStatus.NO_CONTACT, OK, OK, OK]
-    depth = -np.asarray(out.displacement[:, 1])
-    assert float(out.s[0]) == pytest.approx(75.0, abs=0.01)
-    one = jax.jit(
-        lambda s: press_sections(TUBE, WALL, s, 0.0, depth, options=SectionOptions(midline=True))
-    )(out.s[0])
-    np.testing.assert_allclose(out.force, one.force, atol=1e-9)
-    np.testing.assert_allclose(out.end_U, one.end_U, atol=1e-9)
-    with pytest.raises(ValueError, match="session has no skeleton 'sections'"):
-        Session(scene, WALL)
-    with pytest.raises(ValueError, match="material is Material; expected SectionMaterial"):
-        simulate(scene, MATERIAL, path)
-    # Off the midline it has no program, and says so.
-    flat = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, contact=False))
-    asked = jax.eval_shape(simulate, flat, WALL, straight([75.0] * 4, 0.3, 1.0))
-    assert asked.status.shape == (4,)
 
 
 @pytest.mark.slow

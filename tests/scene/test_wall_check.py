@@ -106,16 +106,6 @@ def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm(spacings, where, limit)
         assert np.ptp(spacings[where, depth][0], axis=0).max() < limit
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
-@pytest.mark.parametrize("where", ["on vertices", "between"])
-def test_a_finer_mesh_moves_the_force_by_less_than_2_per_cent(spacings, where):
-    """3 mm deep: of that the facets of the coarse mesh, 0.05 mm, are 1.7 %."""
-    force = np.hypot(*spacings[where, 3.0][1:])
-    assert force.min() > 0.1
-    assert (np.ptp(force, axis=0) / force[2]).max() < 0.02
-
-
 @pytest.mark.parametrize("along", [40, 97, 111])
 def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
     geometry = Geometry.create(93.0, [11.3, 20.1, 33.3, 41.9, 57.0, 71.7], radius=10.0)
@@ -238,26 +228,6 @@ def test_patches_beside_the_wall_are_refused():
         make_scene(TUBE, SPRINGS, poses([75, 19, 0], [75, 17, 0]), tool=BALL, mesh=thin)
     with pytest.raises(MeshError, match=says):
         with_mesh(dataclasses.replace(scene(), tube=good), thin)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_touches_beyond_the_rings_are_unsure_where_the_gap_is_off():
-    """The same waist beyond the last ring: no reason to refuse the mesh, but none for OK."""
-    rings = dataclasses.replace(TUBE, ring_positions=TUBE.ring_positions[:10])
-    mesh = waist(MESHES[1], 130, 0.35, 4)
-    tube = walls_.checked_walls(rings, mesh)
-    beyond = wall_check.look_beyond(mesh, rings, tube)
-    (first, _), (low, high) = beyond.s
-    assert np.isnan(first)
-    assert 115 < low < 130 < high < 145
-    assert f"at s = {low:.3g} to {high:.3g} mm, beyond the rings" in beyond.sentence
-    s = np.array([75.0, 120, 130, 150])
-    status = pressed(tube, np.stack([s, 0 * s + 17, 0 * s], axis=1))[3]
-    np.testing.assert_array_equal(
-        status == PressStatus.CONTACT_UNCERTAIN, [False, False, True, False]
-    )
-    assert (status[[0, 1, 3]] == PressStatus.OK).all()
 
 
 SCENE = """

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import punch_fem
 import pytest
-from late import late
 from run_cli import run as run_cli
 from small_scenes import BALL, BARE, MATERIAL, MESH, OUTER, SPRINGS, TUBE, ball, presses
 
@@ -23,7 +22,6 @@ from jaxtrachea import (
     PlanError,
     Poses,
     Presses,
-    Session,
     make_scene,
     press,
     simulate,
@@ -135,8 +133,8 @@ def test_the_surface_is_the_beam_under_two_forces(s):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["linear", "phong"])
-def test_other_surfaces_are_flat_under_the_tool(method):
+def test_other_surfaces_are_flat_under_the_tool():
+    method = "phong"
     mesh = make_tube(TUBE, around=3, along=200)
     effects = EffectOptions(half_width=HALF, contact="bonded", dent="off", surface=method)
     scene = make_scene(TUBE, STIFF, down([2.0]), mesh=mesh, effects=effects)
@@ -148,7 +146,7 @@ def test_other_surfaces_are_flat_under_the_tool(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("s", "shear"), [(13.0, False), (22.0, False), (73.3, True)])
+@pytest.mark.parametrize(("s", "shear"), [(13.0, False), (73.3, True)])
 def test_the_energy_by_the_place_is_that_of_the_elements(s, shear):
     """Rigid contact: E = D^2 / (2 c(s)), by differences of fourth order."""
     material = dataclasses.replace(STIFF, k_1=jnp.array(1e9), k_3=jnp.array(0.0))
@@ -300,46 +298,15 @@ def test_a_sweep_by_command_lies_on_the_tube(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_steps_of_a_session_are_the_rows_of_simulate():
-    """Led to an end until a part of the tool is off the tube."""
-    effects = dataclasses.replace(PUNCH, contact_point="per_step")
-    path = ball([14, -2, 0], [1, -2, 0], 27)
-    scene = make_scene(TUBE, DEEP, path, tool=BALL, effects=effects)
-    assert scene.plan.has("width")
-    out = run(scene, DEEP, path)
-    status = np.asarray(out.status).tolist()
-    assert {OK, OFF_TUBE} <= set(status)
-    assert ((np.asarray(status) == OFF_TUBE) == (np.asarray(out.s) < HALF)).all()
-    session = Session(scene, DEEP)
-    for i in range(len(status)):
-        step = session.step(path.rotation[i], path.translation[i])
-        assert int(step.status) == status[i]
-        for name in ("force", "skeleton", "joints"):
-            np.testing.assert_allclose(
-                getattr(step, name), getattr(out, name)[i], rtol=1e-9, atol=1e-12, err_msg=name
-            )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
-def test_derivatives_lanes_and_both_precisions(dtype):
+def test_derivatives_and_lanes():
     """Forward = reverse = differences by material, place and depth, surface included; `vmap`."""
     effects = EffectOptions(half_width=HALF, contact="bonded")
     scene = make_scene(TUBE, DEEP, down([3.0], 71.7), mesh=MESH, effects=effects)
-
-    def cast(tree):
-        def one(v):
-            floating = jnp.issubdtype(jnp.asarray(v).dtype, jnp.floating)
-            return jnp.asarray(v, dtype) if floating else v
-
-        return jax.tree.map(one, tree)
-
-    scene = cast(scene)
     names = ("EI_L", "GA_L", "k_M", "k_1", "k_1_ring", "e_1", "e_2")
-    x = jnp.array([float(getattr(DEEP, n)) for n in names] + [71.7, 3.0], dtype)
+    x = jnp.array([float(getattr(DEEP, n)) for n in names] + [71.7, 3.0])
 
     def values(x):
-        material = Material(k_3=cast(0.1), **dict(zip(names, x[:-2], strict=True)))
+        material = Material(k_3=jnp.asarray(0.1), **dict(zip(names, x[:-2], strict=True)))
         D = x[-1] * jnp.array([[0, -1, 0]], x.dtype)
         out = simulate(scene, material, Presses(x[-2:-1], jnp.zeros(1, x.dtype), D))
         moved = out.vertices[0, 100:200:7, 1] - scene.mesh.vertices[100:200:7, 1]
@@ -348,15 +315,6 @@ def test_derivatives_lanes_and_both_precisions(dtype):
     quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     value = quick(values)
     here = value(x)
-    assert here.dtype == dtype
-    if dtype == "float32":
-        wide = jnp.asarray(x, "float64")
-        with jax.numpy_dtype_promotion("standard"):
-            dtype = "float64"
-            scene = make_scene(TUBE, DEEP, down([3.0], 71.7), mesh=MESH, effects=effects)
-            true = np.asarray(quick(values)(wide))
-        np.testing.assert_allclose(here, true, rtol=1e-3, atol=1e-4)
-        return
     forward, reverse = quick(jax.jacfwd(values))(x), quick(jax.jacrev(values))(x)
     np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-11)
     for i in range(len(x)):

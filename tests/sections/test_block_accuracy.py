@@ -136,8 +136,7 @@ def test_modes_without_compliance_of_their_own(m):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("m", [7, 14])
-@pytest.mark.parametrize("symmetric", [False, True])
+@pytest.mark.parametrize(("m", "symmetric"), [(7, False), (14, True)])
 def test_derivative_is_that_of_an_inverse(symmetric, m):
     """-X dA X forward, -X^T c X^T reverse; for symmetric changes of symmetric matrices."""
     rng = np.random.default_rng(m)

@@ -56,9 +56,9 @@ def random_blocks(n, m, indefinite):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("n", [2, 3, 8, 9])
+@pytest.mark.parametrize("n", [2, 9])
 @pytest.mark.parametrize("indefinite", [False, True])
-@pytest.mark.parametrize(("m", "alone"), [(7, True), (7, False), (14, True), (14, False)])
+@pytest.mark.parametrize(("m", "alone"), [(7, True), (14, False)])
 def test_block_elimination_is_dense(m, alone, indefinite, n):
     """As single kernels or not; also of many lanes, whose products are the library's."""
     D, U, dense = random_blocks(n, m, indefinite)

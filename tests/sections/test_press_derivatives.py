@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.sections.press import build, press_sections
-from jaxtrachea.mechanics.sections.solve import solve_path
+from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -53,40 +52,6 @@ def central_differences():
 @functools.cache
 def forward():
     return np.stack([ahead(FLAT, v)[1] for v in UNIT], 1)
-
-
-def force_alone(flat):
-    """The force on the midline by the parts that solve for it: quicker to compile."""
-    geometry, material, (s_c, phi_c, direction, path) = UNRAVEL(flat)
-    parts = build(geometry, material, s_c, 0 * phi_c, direction, midline=True)
-    return solve_path(parts, path).state.force[-1, 0]
-
-
-@pytest.mark.slow
-def test_along_one_direction():
-    """All of geometry, material, place and path at once, midline and 5 mm."""
-    along = jnp.asarray(np.random.default_rng(0).normal(size=FLAT.size)) * FLAT
-    both = jax.jit(lambda x: jax.jvp(force_alone, (x,), (along,)))
-    h = 1e-4
-    value, slope = both(FLAT)
-    difference = (both(FLAT + h * along)[0] - both(FLAT - h * along)[0]) / (2 * h)
-    assert np.all(np.abs(slope) > 0.1 * np.abs(value))
-    np.testing.assert_allclose(slope, difference, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_many_directions_at_once():
-    """As one after the other; a compiler has failed on them before (`mechanics.skeleton`)."""
-    chosen = UNIT[:: FLAT.size // 6]
-
-    def along(v):
-        return jax.jvp(force_alone, (FLAT,), (v,))[1]
-
-    together = jax.jit(jax.vmap(along))(chosen)
-    alone = jax.jit(along)
-    each = np.stack([alone(v) for v in chosen])
-    assert np.abs(each).max() > 0.01
-    np.testing.assert_allclose(together, each, atol=1e-10 * np.abs(each).max())
 
 
 @pytest.mark.slow
