@@ -136,10 +136,10 @@ class Traced:
         folder, device, _, kinds = key
         with self._compiling.setdefault(key, threading.Lock()):
             if key not in self._compiled:
-                compiled = self._plain
+                compiled = None
                 with contextlib.suppress(Exception):  # what is wrong is said by the plain call
                     compiled = self._by_trace(folder, given, kinds, device)
-                self._compiled[key] = compiled
+                self._compiled[key] = compiled or self._plain
             return self._compiled[key]
 
     def lower(self, *arguments: Any, **named: Any) -> Any:
