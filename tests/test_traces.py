@@ -1,5 +1,6 @@
 """Functions that are not traced anew at every start: what is kept, and what must not be."""
 
+import csv
 import functools
 import hashlib
 import os
@@ -8,6 +9,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import equinox as eqx
@@ -18,7 +20,8 @@ import pytest
 from compilations import compilations
 
 from jaxtrachea._compiler import quick_options
-from jaxtrachea.files import traces
+from jaxtrachea.files import kept_trace, traces
+from jaxtrachea.files.lock import take
 from jaxtrachea.files.traces import Traced, keep_traces
 from jaxtrachea.optimisation import programs
 
@@ -70,6 +73,7 @@ def folder(tmp_path, monkeypatch):
     """
     monkeypatch.setattr(traces, "_KNOWN", traces._KNOWN | {__name__.split(".")[0]})
     monkeypatch.setattr(traces, "_start", np.inf)
+    monkeypatch.setattr(traces, "_found_unoptimised", [])
     TRACES.clear()
     start()
     keep_traces(tmp_path)
@@ -151,9 +155,40 @@ def test_without_optimisation_the_trace_is_the_same(folder):
         assert len(seen) >= 1
         np.testing.assert_allclose(out[0], 0.5 + x, rtol=1e-15)
         np.testing.assert_allclose(out[1], np.sin(x), rtol=1e-14)
-        assert (run._options == quick_options()) is unoptimised
+        assert (traces._found_unoptimised != []) is unoptimised
     assert TRACES == ["add"]
     assert len(list(folder.iterdir())) == 1
+
+
+def test_a_program_that_is_used_again_is_optimised_afterwards(folder, monkeypatch):
+    """First and second start compile without optimisation; the third after it was seen to."""
+    x, options = np.linspace(0.1, 2.0, 5), []
+    monkeypatch.setattr(traces, "quick_options", lambda: options.append(1) or quick_options())
+    begun = []
+    monkeypatch.setattr(kept_trace, "optimise_afterwards", lambda paths: begun.append([*paths]))
+    for unoptimised_so_far, given_over in ((1, 0), (2, 1), (2, 1)):
+        start()
+        state = np.full(5, 0.5)
+        out = Traced(add, donate=(0,), unoptimised=True)(state, x)
+        np.testing.assert_allclose(out[1], np.sin(x), rtol=1e-14)
+        traces.optimise_afterwards()
+        assert (len(options), len(begun)) == (unoptimised_so_far, given_over)
+        for paths in begun:
+            kept_trace.optimise(paths)
+            assert kept_trace.read(paths[0]).optimised
+    assert TRACES == ["add"]
+
+
+def test_one_process_optimises_at_a_time(folder):
+    Traced(add, unoptimised=True)(np.zeros(3), np.ones(3))
+    (path,) = folder.iterdir()
+    lock = take(folder)
+    kept_trace.optimise([path])
+    assert not kept_trace.read(path).optimised
+    lock.release()
+    kept_trace.optimise([folder / "gone", path])
+    assert kept_trace.read(path).optimised
+    assert kept(folder) == [path.name]
 
 
 def test_outputs_go_in_again_and_compile_nothing(folder):
@@ -247,7 +282,8 @@ def test_keys_of_random_numbers(folder):
 
 DEVICES = """
 import threading, jax, numpy as np
-from jaxtrachea.files import traces
+from jaxtrachea.files import kept_trace, traces
+from jaxtrachea.files.lock import take
 from test_traces import add
 import pathlib, sys
 traces._KNOWN.add("test_traces")
@@ -341,7 +377,7 @@ def test_a_damaged_trace_is_made_anew(folder):
     for damaged in (whole[:-1], b"", whole[:200] + bytes([whole[200] ^ 1]) + whole[201:]):
         path.write_bytes(damaged)
         assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
-        assert traces._content(path) is not None
+        assert kept_trace.read(path) is not None
     assert len(TRACES) == 4
 
 
@@ -349,7 +385,12 @@ def test_a_trace_that_cannot_be_read_is_no_fault(folder):
     """Whole, and yet of no use: it is traced as ever."""
     Traced(add)(np.zeros(3), np.ones(3))
     (path,) = folder.iterdir()
-    for content in (b"", b"no pickle", pickle.dumps((b"no trace", 0)), b"cno_module\nx\n."):
+    for content in (
+        b"",
+        b"no pickle",
+        pickle.dumps(("add", b"no trace", 0, ())),
+        b"cno_module\nx\n.",
+    ):
         path.write_bytes(hashlib.sha256(content).digest() + content)
         assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
 
@@ -401,32 +442,72 @@ sys.exit(main())
 """
 
 
+def started(command, folder, seed):
+    """A command in a process of its own: what it traces, and its tables.
+
+    Another seed of Python's hashes, as every process has by itself.
+    """
+    environment = os.environ | {
+        "JAX_ENABLE_COMPILATION_CACHE": "true",
+        "JAX_COMPILATION_CACHE_DIR": str(folder / "kept"),
+        "PYTHONHASHSEED": seed,
+    }
+    out = folder / seed
+    done = subprocess.run(
+        [sys.executable, "-c", COUNTED, *command, "--out", str(out)],
+        capture_output=True, text=True, check=True, env=environment, cwd=ROOT,
+    )  # fmt: skip
+    tables = {path.relative_to(out): path.read_text() for path in out.rglob("*.csv")}
+    return re.findall(r"traced (\w+)", done.stderr), tables
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     ("command", "main"),
     [
-        (["fit", "fits/virtual_trachea/fit.toml"], {"_advance", "information", "residual_value"}),
-        (["simulate", "configs/cross_sections.toml"], {"simulate"}),
+        (["simulate", "configs/cross_sections.toml"], "simulate"),
     ],
     ids=lambda v: Path(v[1]).stem if isinstance(v, list) else "",
 )
 def test_warm_commands_trace_none_of_their_programs(command, main, tmp_path):
-    """The same numbers; another seed of Python's hashes, as every process has by itself."""
-    said, made = [], []
-    for seed in ("1", "2"):
-        environment = os.environ | {
-            "JAX_ENABLE_COMPILATION_CACHE": "true",
-            "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "kept"),
-            "PYTHONHASHSEED": seed,
-        }
-        done = subprocess.run(
-            [sys.executable, "-c", COUNTED, *command, "--out", str(tmp_path / seed)],
-            capture_output=True, text=True, check=True, env=environment, cwd=ROOT,
-        )  # fmt: skip
-        said.append(re.findall(r"traced (\w+)", done.stderr))
-        made.append({p.relative_to(tmp_path / seed): p.read_bytes()
-                     for p in (tmp_path / seed).rglob("*.csv")})  # fmt: skip
-    assert main <= set(said[0])
-    assert said[1] == []
-    assert made[0] == made[1]
+    """The same numbers."""
+    (cold, made), (warm, again) = (started(command, tmp_path, seed) for seed in ("1", "2"))
+    assert main in cold
+    assert warm == []
+    assert made == again
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_the_third_fit_finds_its_programs_optimised(tmp_path):
+    """The second traces nothing, and has them optimised: the third gives the same but for rounding.
+
+    The third compiles nothing: no program is new.
+    """
+
+    def programs():
+        return {path.name for path in (tmp_path / "kept").glob("*-cache")}
+
+    command = ["fit", "fits/virtual_trachea/fit.toml"]
+    cold, made = started(command, tmp_path, "1")
+    unoptimised = programs()
+    warm, again = started(command, tmp_path, "2")
+    assert {"_advance", "information", "residual_value"} <= set(cold)
+    assert warm == []
+    assert made == again
+
+    traced, end = [*(tmp_path / "kept").glob("*-traced")], time.monotonic() + 300
+    while not all(kept_trace.read(path).optimised for path in traced):
+        assert time.monotonic() < end
+        time.sleep(0.5)
+    optimised = programs()
+    assert optimised > unoptimised
+    third, last = started(command, tmp_path, "3")
+    assert third == []
+    assert programs() == optimised
+    estimates = [
+        [float(row["value"]) for row in csv.DictReader(tables[Path("parameters.csv")].splitlines())]
+        for tables in (made, last)
+    ]
+    np.testing.assert_allclose(*estimates, rtol=1e-6)

@@ -41,14 +41,15 @@ def plain(name: str, longest: int = LONGEST) -> str:
 
 
 def save_each(
-    folder: Path, drawings: Mapping[str, Callable[[], Any]], **options: Any
+    folder: Path, drawings: Mapping[str, Callable[[], Any]]
 ) -> tuple[list[Path], dict[str, str]]:
     """Draw and write every picture; one that fails is left out, whatever it failed of.
 
+    `Figure.savefig` goes through a figure twice, the first time without drawing it.
+
     Args:
         folder: where to.
-        drawings: file name, with its ending, to what returns the figure.
-        options: of `Figure.savefig`.
+        drawings: name of a PNG file to what returns the figure.
 
     Returns:
         The files written, and for those that are not, why.
@@ -56,6 +57,8 @@ def save_each(
     Raises:
         OSError: a file cannot be written.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     paths, lost = [], {}
     for name, draw in drawings.items():
         memory = io.BytesIO()
@@ -63,7 +66,7 @@ def save_each(
             with warnings.catch_warnings():
                 # A letter that the font has not got is drawn as a box.
                 warnings.filterwarnings("ignore", message=r"(?s).*Glyph .* missing")
-                draw().savefig(memory, format=Path(name).suffix[1:], **options)
+                FigureCanvasAgg(draw()).print_png(memory)
         except Exception as error:  # a picture is worth less than the numbers
             lost[name] = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             continue

@@ -31,7 +31,8 @@ from jax.core import Tracer
 
 import jaxtrachea
 from jaxtrachea._compiler import quick_options
-from jaxtrachea.files.atomic import write_whole
+from jaxtrachea.files import kept_trace
+from jaxtrachea.files.kept_trace import KeptTrace
 from jaxtrachea.files.programs import TRACED
 from jaxtrachea.files.provenance import installed, source_digest
 
@@ -42,12 +43,12 @@ _KNOWN = {"jaxtrachea", "builtins", "collections", "copyreg", "enum", "functools
 _KNOWN |= {"pathlib", "types", *_VERSIONS}
 #: Settings of JAX that say where files are kept and what is run where, not what is computed.
 _ELSEWHERE = ("cache", "_log", "dump", "default_device")
-#: Bytes of the digest that comes before the content of a file.
-_DIGEST = hashlib.sha256().digest_size
 
 #: When this process began, s; what it took to come here was processor time.
 _start = time.time() - time.process_time()
 _folder: Path | None = None
+#: Traces that this process found, whose programs are not optimised yet.
+_found_unoptimised: list[Path] = []
 
 
 def keep_traces(folder: Path | None) -> None:
@@ -58,6 +59,13 @@ def keep_traces(folder: Path | None) -> None:
     global _folder
     remote = folder is not None and folder.parts[:1] and folder.parts[0].endswith(":")
     _folder = None if remote else folder
+
+
+def optimise_afterwards() -> None:
+    """Have what this process found unoptimised be optimised for later starts; nobody waits."""
+    if _found_unoptimised:
+        kept_trace.optimise_afterwards(_found_unoptimised)
+        _found_unoptimised.clear()
 
 
 class Traced:
@@ -79,17 +87,23 @@ class Traced:
             static: its first arguments.
             axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
             donate: of the other arguments, as `donate_argnums` of `jax.jit`.
-            unoptimised: compiled without optimisation; the trace is the same.
+            unoptimised: compiled without optimisation, until `optimise_afterwards` has seen to it;
+                the trace is the same.
             named: static arguments by name.
         """
         self._name, self._donate = function.__name__, donate
         self._identity = (function, static, named, axes, donate)
         one = functools.partial(function, *static, **named)
         self._function = one if axes is None else jax.vmap(one, axes)
-        self._options = quick_options() if unoptimised else None
-        self._plain = jax.jit(self._function, donate_argnums=donate, compiler_options=self._options)
+        self._unoptimised = unoptimised
         self._compiled: dict[Any, Callable] = {}
         self._compiling: dict[Any, threading.Lock] = {}
+
+    @functools.cached_property
+    def _plain(self) -> Any:
+        """As `jax.jit` makes it."""
+        options = quick_options() if self._unoptimised else None
+        return jax.jit(self._function, donate_argnums=self._donate, compiler_options=options)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
@@ -122,10 +136,10 @@ class Traced:
         folder, device, _, kinds = key
         with self._compiling.setdefault(key, threading.Lock()):
             if key not in self._compiled:
-                compiled = self._plain
+                compiled = None
                 with contextlib.suppress(Exception):  # what is wrong is said by the plain call
                     compiled = self._by_trace(folder, given, kinds, device)
-                self._compiled[key] = compiled
+                self._compiled[key] = compiled or self._plain
             return self._compiled[key]
 
     def lower(self, *arguments: Any, **named: Any) -> Any:
@@ -140,27 +154,25 @@ class Traced:
         named = [(shape, str(dtype), weak) for shape, dtype, weak in kinds]
         digest.update(_said((self._identity, jax.tree.unflatten(tree, named))))
         path = folder / f"{self._name}-{digest.hexdigest()}{TRACED}"
-        content = _content(path)
-        if content is None:
-            content = self._traced(leaves, tree, device)
+        kept = kept_trace.read(path)
+        found = kept is not None
+        if kept is None:
+            kept = self._traced(leaves, tree, device, self._donated(given[0]))
             with contextlib.suppress(OSError):  # then the next start traces anew
-                folder.mkdir(parents=True, exist_ok=True)
-                write_whole(path, hashlib.sha256(content).digest() + content)
-        trace, made = pickle.loads(content)
-        call, structure = export.deserialize(bytearray(trace)).call, jax.tree.structure(made)
-        flat = self._named(lambda *leaves: call(*leaves))
-        # Compiled here: what an exported function returns is bound to its device, and `jax.jit`
-        # would compile it once more when given that.
-        lowered = jax.jit(flat, donate_argnums=self._donated(given[0])).lower(*leaves)
-        run = lowered.compile(self._options)
+                kept_trace.write(path, kept)
+        unoptimised = self._unoptimised and not kept.optimised
+        if found and unoptimised:
+            _found_unoptimised.append(path)
+        run = kept.lower(leaves).compile(quick_options() if unoptimised else None)
+        structure = jax.tree.structure(kept.returns)
 
         def compiled(*arguments, **named):
             return jax.tree.unflatten(structure, run(*jax.tree.leaves((arguments, named))))
 
         return compiled
 
-    def _traced(self, leaves: list, tree: Any, device: Any) -> bytes:
-        """The trace and the structure of what it returns.
+    def _traced(self, leaves: list, tree: Any, device: Any, donated: tuple) -> KeptTrace:
+        """The trace of arguments like these.
 
         Raises:
             TypeError: what it returns has weak types, which a trace does not keep.
@@ -177,14 +189,10 @@ class Traced:
 
         # JAX's own name of the backend (cuda, rocm) is not that of its devices (gpu).
         where = None if device.platform == jax.default_backend() else (device.platform,)
-        trace = export.export(jax.jit(self._named(flat)), platforms=where)(*leaves)
-        _said(made[0])
-        return pickle.dumps((bytes(trace.serialize()), made[0]), protocol=5)
-
-    def _named(self, flat: Callable) -> Callable:
-        """The function under the name by which JAX calls its program."""
         flat.__name__ = flat.__qualname__ = self._name
-        return flat
+        trace = export.export(jax.jit(flat), platforms=where)(*leaves)
+        _said(made[0])
+        return KeptTrace(self._name, bytes(trace.serialize()), made[0], donated)
 
     def _donated(self, arguments: tuple) -> tuple[int, ...]:
         """Positions of the donated arguments' leaves among all."""
@@ -261,13 +269,3 @@ def _surroundings(backend: str) -> bytes:
     ]
     ours = [(k, v) for k, v in sorted(os.environ.items()) if k.startswith("JAXTRACHEA_")]
     return repr((_sources(), settings, ours, backend)).encode()
-
-
-def _content(path: Path) -> bytes | None:
-    """What is kept in a file; None: there is none that is whole."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    digest, content = content[:_DIGEST], content[_DIGEST:]
-    return content if hashlib.sha256(content).digest() == digest else None

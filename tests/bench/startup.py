@@ -104,7 +104,7 @@ def commands(out: common.Writer) -> None:
     quick = {"jaxtrachea --help": ["--help"], "jaxtrachea --version": ["--version"]}
     samples = {name: [] for name in quick}
     kept, added = {}, {}
-    with tempfile.TemporaryDirectory() as base:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as base:
         for i in range(3):
             for name, arguments in quick.items():
                 samples[name].append(command(arguments, Path(base))[0])
