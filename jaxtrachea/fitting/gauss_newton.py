@@ -51,9 +51,10 @@ class GaussNewton:
         self._empty(study, dtype)
 
     def _empty(self, study: Study, dtype: np.dtype) -> None:
-        self.stream, self._rounding = Stream(study, dtype), epsilon(dtype)
+        theta = study.of_unknowns(lambda p: p.to_scaled(p.value), 0.0)[0]
+        self.stream, self._rounding = Stream(study, theta, dtype), epsilon(dtype)
         self.structure, self.finite = nothing_open(study), True
-        self._move_to(study.of_unknowns(lambda p: p.to_scaled(p.value), 0.0)[0])
+        self._move_to(theta)
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "1 P"]:
@@ -74,18 +75,19 @@ class GaussNewton:
     def append(self, displacement: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"]) -> None:
         """Take samples, mm and N, and one step."""
         self.stream.append(displacement, force)
-        self._evaluate()
-        if self.finite:
-            self._move_to(self.theta + self._step(known=1.0))
+        self.finite = self.stream.advance(self.theta)
+        self._move_to(self.stream.point)
+        self._move_to(self.theta + self._step(known=1.0))
 
     def settle(self) -> bool:
-        """Evaluate all samples at the estimate and step, until it stays: whether it does."""
+        """Linearise all samples at the estimate and step, until it stays: whether it does."""
         lowest, best = np.inf, self.theta
         # What rounding leaves, in standard errors.
         lanes = self.stream.study.lanes
         rounding = self._rounding * float(np.linalg.norm(lanes.force * lanes.precision))
         for _ in range(STEPS):
-            self._evaluate(everything=True)
+            self.finite = self.stream.sweep(self.theta)
+            self._move_to(self.theta)
             if not self.finite or self.sums.cost > lowest + rounding * (1 + lowest):
                 self._move_to(0.5 * (best + self.theta))  # further than the quadratic holds
                 continue
@@ -94,6 +96,8 @@ class GaussNewton:
             if step @ self.sums.hessian @ step <= max(SETTLED, rounding) ** 2:
                 return True
             self._move_to(self.theta + step)
+        self.stream.sweep(best)
+        self._move_to(best)
         return False
 
     def uncertainty(self) -> Uncertainty:
@@ -124,10 +128,6 @@ class GaussNewton:
         step = step * LONGEST / max(LONGEST, float(np.linalg.norm(step)))
         ahead: np.ndarray = np.clip(self.theta + unit * step, lanes.lower[0], lanes.upper[0])
         return ahead - self.theta
-
-    def _evaluate(self, *, everything: bool = False) -> None:
-        self.finite = self.stream.evaluate(self.theta, self.natural[0], everything=everything)
-        self.sums = self.stream.sums(self.theta)
 
     def _move_to(self, theta: Float[np.ndarray, " P"]) -> None:
         study, self.theta, self.sums = self.stream.study, theta, self.stream.sums(theta)

@@ -1,17 +1,18 @@
 """Curves that grow sample by sample, and the normal equations of what they hold so far.
 
-The samples lie in blocks, each with its normal equations at a point of its own. A new sample, and
-an estimate that has moved, cost as much whether there are ten samples or ten thousand: a few blocks
-are evaluated anew, those that changed and those whose points are farthest from the estimate. The
-sum of all blocks is the quadratic whose minimum a Gauss-Newton step finds; with every block at the
-estimate it is that of a whole fit. One program evaluates blocks, however many there are.
+The samples lie in blocks, each with its normal equations. The sum of all is the quadratic whose
+minimum a Gauss-Newton step finds. All blocks are linearised at one point: at several points each
+would leave another combination undetermined, and their sum none. A sweep over the blocks to the
+newest estimate is always under way, a few of them with every sample, and takes the place of the
+present point when it is through. So a sample costs as much whether it is the tenth or the
+ten-thousandth. One program evaluates blocks, however many there are.
 """
 
 import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from jaxtrachea.fitting.cost import evaluate
 from jaxtrachea.fitting.information import Information
@@ -40,26 +41,28 @@ class Sums(NamedTuple):
     hessian: Float[np.ndarray, "P P"]
 
 
-class _Blocks(NamedTuple):
-    """All blocks, with room for more.
+class _Equations:
+    """Normal equations of all blocks at one point, with room for more.
 
     Attributes:
-        place: trial, and which block of it.
-        changed: it has samples that were not evaluated yet.
-        evaluated: it has normal equations.
-        point: where these were taken, scaled coordinates.
-        cost: there.
-        gradient: -
-        hessian: -
+        point: scaled coordinates; (P,).
+        fresh: blocks of which all samples are in; (B,).
+        cost: (B,).
+        gradient: (B, P).
+        hessian: (B, P, P).
+        residual: model minus data, N; NaN where there is no sample; (B, `BLOCK`).
     """
 
-    place: Int[np.ndarray, "B 2"]
-    changed: Bool[np.ndarray, " B"]
-    evaluated: Bool[np.ndarray, " B"]
-    point: Float[np.ndarray, "B P"]
-    cost: Float[np.ndarray, " B"]
-    gradient: Float[np.ndarray, "B P"]
-    hessian: Float[np.ndarray, "B P P"]
+    def __init__(self, point: Float[np.ndarray, " P"], size: int = 64):
+        P, self.point, self.fresh = len(point), point, np.zeros(size, bool)
+        self.cost, self.gradient = np.zeros(size), np.zeros((size, P))
+        self.hessian, self.residual = np.zeros((size, P, P)), np.full((size, BLOCK), np.nan)
+
+    def double(self) -> None:
+        """Room for twice as many blocks."""
+        more = _Equations(self.point, len(self.cost))
+        for name in ("fresh", "cost", "gradient", "hessian", "residual"):
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(more, name)]))
 
 
 class Stream:
@@ -69,15 +72,14 @@ class Stream:
         study: one lane with room for some trials and samples; what is not yet measured is padding.
             Its arrays are written in place, and it has no `curves`.
         lengths: samples of each curve that has begun.
-        residual: model minus data where each sample was evaluated last, N; NaN in padding;
-            (1, T, N).
     """
 
-    def __init__(self, study: Study, dtype: np.dtype):
+    def __init__(self, study: Study, theta: Float[np.ndarray, " P"], dtype: np.dtype):
         """No curve yet.
 
         Args:
             study: of one curve of `BLOCK` samples with sigma given: model, unknowns and sigma.
+            theta: first point, scaled coordinates.
             dtype: of the evaluation; sums are of float64.
         """
         self._dtype, self._sigma = dtype, 1 / float(study.lanes.precision[0, 0, 0])
@@ -86,13 +88,11 @@ class Stream:
         lanes = study.lanes._replace(**blank)
         self.study = dataclasses.replace(study, lanes=lanes, curves=((),), change_points=None)
         self.lengths: list[int] = []
-        self.residual = np.full((1, 1, BLOCK), np.nan)
-        P, self._count, self._first = study.size, 0, 0
-        self._blocks = _Blocks(
-            np.zeros((64, 2), int), np.zeros(64, bool), np.zeros(64, bool), np.zeros((64, P)),
-            np.zeros(64), np.zeros((64, P)), np.zeros((64, P, P)),
-        )  # fmt: skip
         self._make_room(8, 4 * BLOCK)
+        # Trial of every block, and which of its blocks; those of the last curve begin at `_first`.
+        self._place, self._count, self._first = np.zeros((64, 2), int), 0, 0
+        self._now, self._next = _Equations(theta), _Equations(theta)
+        self._sweeping = False
 
     def _make_room(self, trials: int, samples: int) -> None:
         """More padding; nothing is compiled."""
@@ -102,7 +102,6 @@ class Stream:
         for name in _OF_TRIALS:
             array = getattr(lanes, name)
             new[name] = np.pad(array, [*more[:2], (0, 0)][: array.ndim], mode="edge")
-        self.residual = np.pad(self.residual, more, constant_values=np.nan)
         self.study = dataclasses.replace(self.study, lanes=lanes._replace(**new))
 
     def begin(self, s_c: float) -> None:
@@ -126,57 +125,76 @@ class Stream:
         self.lengths[-1] = end
         numbers = np.arange(begin // BLOCK, -(-end // BLOCK))
         self._count = self._first + int(numbers[-1]) + 1
-        while self._count > len(self._blocks.cost):
-            grown = (np.concatenate([v, np.zeros_like(v)]) for v in self._blocks)
-            self._blocks = _Blocks(*grown)
-        self._blocks.place[self._first + numbers] = np.stack([np.full_like(numbers, t), numbers], 1)
-        self._blocks.changed[self._first + numbers] = True
+        while self._count > len(self._place):
+            self._place = np.concatenate([self._place, np.zeros_like(self._place)])
+            self._now.double()
+            self._next.double()
+        at = self._first + numbers
+        self._place[at] = np.stack([np.full_like(numbers, t), numbers], 1)
+        self._now.fresh[at] = self._next.fresh[at] = False
 
-    def evaluate(
-        self,
-        theta: Float[np.ndarray, " P"],
-        unit: Float[np.ndarray, " P"],
-        *,
-        everything: bool = False,
-    ) -> bool:
-        """Take blocks anew at `theta`: all that changed, and of the others the farthest, or all.
+    @property
+    def point(self) -> Float[np.ndarray, " P"]:
+        """Where all blocks are linearised, scaled coordinates."""
+        return self._now.point
 
-        Args:
-            theta: scaled coordinates.
-            unit: of every unknown, in which distances are measured.
-            everything: all blocks.
+    @property
+    def residual(self) -> Float[np.ndarray, "1 T N"]:
+        """Model minus data at the point, N; NaN in padding."""
+        out = np.full(self.study.lanes.force.shape, np.nan)
+        self._by_block(out)[tuple(self._place[: self._count].T)] = self._now.residual[: self._count]
+        return out
+
+    def advance(self, theta: Float[np.ndarray, " P"]) -> bool:
+        """Take in new samples, and go on with the sweep to a new point; `theta` if none is on.
 
         Returns:
-            Whether the model gave finite numbers; where not, blocks are as they were.
+            Whether the model gave finite numbers for the new samples at the present point; a block
+            where it did not stays as it was.
         """
-        n = self._count
-        changed = self._blocks.changed[:n]
-        far = np.max(np.abs(self._blocks.point[:n] - theta) / unit, axis=1)
-        order = np.argsort(np.where(changed, -np.inf, -far), kind="stable")
-        least = n if everything else max(int(changed.sum()), 1)
-        firsts = range(0, least, TOGETHER)
-        return all([self._evaluate(order[i : i + TOGETHER], theta) for i in firsts])
+        if not self._sweeping:
+            self._next.point, self._sweeping = theta, True
+            self._next.fresh[:] = False
+        new, left = (np.flatnonzero(~e.fresh[: self._count]) for e in (self._now, self._next))
+        slots = TOGETHER * (len(new) // TOGETHER + 1) - len(new)
+        jobs = [(self._now, b) for b in new] + [(self._next, b) for b in left[:slots]]
+        for first in range(0, len(jobs), TOGETHER):
+            self._evaluate(jobs[first : first + TOGETHER])
+        if not self._next.fresh[left[:slots]].all():  # no equilibrium so far away
+            self._next.point = 0.5 * (self._now.point + self._next.point)
+            self._next.fresh[:] = False
+        elif self._next.fresh[: self._count].all():
+            self._now, self._next, self._sweeping = self._next, self._now, False
+        return bool(self._now.fresh[: self._count].all())
 
-    def _evaluate(self, chosen: Int[np.ndarray, " b"], theta: Float[np.ndarray, " P"]) -> bool:
-        """At most `TOGETHER` blocks."""
-        lanes, count = self.study.lanes, len(chosen)
-        t, number = self._blocks.place[np.resize(chosen, TOGETHER)].T
+    def sweep(self, theta: Float[np.ndarray, " P"]) -> bool:
+        """Linearise all blocks at `theta`: whether the model gave finite numbers there."""
+        self._next.point, self._next.fresh[:], self._sweeping = theta, False, False
+        for first in range(0, self._count, TOGETHER):
+            blocks = range(first, min(first + TOGETHER, self._count))
+            self._evaluate([(self._next, b) for b in blocks])
+        if finite := bool(self._next.fresh[: self._count].all()):
+            self._now, self._next = self._next, self._now
+        return finite
+
+    def _evaluate(self, jobs: list[tuple[_Equations, int]]) -> None:
+        """At most `TOGETHER` blocks, each at the point of its equations; finite ones are put in."""
+        lanes, full = self.study.lanes, [jobs[i % len(jobs)] for i in range(TOGETHER)]
+        t, number = self._place[[b for _, b in full]].T
         part = {k: getattr(lanes, k)[0, t][:, None] for k in _OF_TRIALS}
         part |= {k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES}
         part |= {k: np.repeat(getattr(lanes, k), TOGETHER, 0) for k in _OF_UNKNOWNS}
-        given = np.tile(theta, (TOGETHER, 1)), lanes._replace(**part), np.ones((TOGETHER, 2))
+        theta = np.stack([equations.point for equations, _ in full])
+        given = theta, lanes._replace(**part), np.ones((TOGETHER, 2))
         point = self._program(*cast(given, self._dtype))
         found = (point.cost, point.gradient, point.hessian, point.value)
-        cost, gradient, hessian, value = (np.asarray(v, np.float64)[:count] for v in found)
-        if not (np.isfinite(cost).all() and np.isfinite(hessian).all()):
-            return False
-        blocks = self._blocks
-        blocks.point[chosen], blocks.cost[chosen] = theta, cost
-        blocks.gradient[chosen], blocks.hessian[chosen] = gradient, hessian
-        blocks.changed[chosen], blocks.evaluated[chosen] = False, True
-        value = np.where(part["precision"][:count, 0] > 0, value[:, 0] * self._sigma, np.nan)
-        self._by_block(self.residual)[t[:count], number[:count]] = value
-        return True
+        cost, gradient, hessian, value = (np.asarray(v, np.float64) for v in found)
+        seen = part["precision"][:, 0] > 0
+        for i, (equations, b) in enumerate(jobs):
+            if np.isfinite(cost[i]) and np.isfinite(hessian[i]).all():
+                equations.cost[b], equations.gradient[b] = cost[i], gradient[i]
+                equations.hessian[b], equations.fresh[b] = hessian[i], True
+                equations.residual[b] = np.where(seen[i], value[i, 0] * self._sigma, np.nan)
 
     @staticmethod
     def _by_block(array: Float[np.ndarray, "1 T N"]) -> Float[np.ndarray, "T blocks samples"]:
@@ -184,14 +202,13 @@ class Stream:
         return array[0].reshape(array.shape[1], -1, BLOCK)
 
     def sums(self, theta: Float[np.ndarray, " P"]) -> Sums:
-        """The quadratics of all blocks, about `theta`."""
+        """The quadratic of all blocks, about `theta`."""
         # What was never evaluated is zeros.
-        blocks = _Blocks(*(v[: self._count] for v in self._blocks))
-        away = np.where(blocks.evaluated[:, None], theta - blocks.point, 0)
-        bent = np.einsum("bij,bj->bi", blocks.hessian, away)
-        cost = blocks.cost.sum() + np.sum(away * (blocks.gradient + 0.5 * bent))
-        gradient = (blocks.gradient + bent).sum(axis=0)
-        return Sums(float(cost), gradient, blocks.hessian.sum(axis=0))
+        own, away = self._now, theta - self._now.point
+        gradient, hessian = own.gradient.sum(axis=0), own.hessian.sum(axis=0)
+        bent = hessian @ away
+        cost = own.cost.sum() + away @ (gradient + 0.5 * bent)
+        return Sums(float(cost), gradient + bent, hessian)
 
     def information(self, sums: Sums) -> Information:
         """The same as a fit has it, of the one lane."""

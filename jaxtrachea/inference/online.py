@@ -17,34 +17,34 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.effective import effective
 from jaxtrachea.fitting.fit import final_status
 from jaxtrachea.fitting.gauss_newton import GaussNewton
-from jaxtrachea.fitting.lanes import Noise, Weighting
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.misfit import Residuals
 from jaxtrachea.fitting.needs_review import local_doubt
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.refusals import Size, check_curve, refusal
 from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.fitting.starts import scales
-from jaxtrachea.fitting.stream import BLOCK
-from jaxtrachea.fitting.study import Study, Table, build_study
+from jaxtrachea.fitting.study import Study, Table
 from jaxtrachea.fitting.verdict import verdict
 from jaxtrachea.fitting.zeros import resolved
-from jaxtrachea.inference.design.candidates import Candidates
 from jaxtrachea.inference.design.choice import Criterion, gains, scores_after
 from jaxtrachea.inference.design.situation import Situation, of_bounds
+from jaxtrachea.inference.online_model import (
+    CURE,
+    SPECIMEN,
+    blank_study,
+    check,
+    places_of,
+    study_of,
+)
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 
-#: What the curves of a stream belong to.
-SPECIMEN = "online"
 #: Move of the estimate from which on the gains of presses are computed anew, in natural sizes of
 #: the unknowns (1: 100 %).
 MOVED = 0.02
-#: Default places for the next press.
-PLACES = 25
-_CURE = "fit the curves together by build_study and fit"
 
 
 class OnlineState(NamedTuple):
@@ -60,8 +60,8 @@ class OnlineState(NamedTuple):
             (P, P).
         verdict: one of `VERDICTS` for every unknown, of the local error alone; "failed" without an
             estimate.
-        next_point: position of the most telling next press, mm; None where the model misses the
-            curves, or there is no estimate.
+        next_point: position of the most telling next press, mm, as far as estimate and model can
+            be trusted; the bounds count as a weak prior, so that there is one before any sample.
         samples: so far.
         status: as of a fit; NON_FINITE: a sample without equilibrium at the estimate.
         message: what speaks against the estimate, "" if nothing does.
@@ -73,7 +73,7 @@ class OnlineState(NamedTuple):
     relative_error: Float[np.ndarray, " P"]
     covariance: Float[np.ndarray, "P P"]
     verdict: tuple[str, ...]
-    next_point: float | None
+    next_point: float
     samples: int
     status: FitStatus
     message: str
@@ -84,7 +84,8 @@ class Online:
 
     All is compiled when it is made; a sample compiles nothing (but where a ninth position, a
     seventeenth, ... leaves the structure in doubt), and takes as long whether it is the tenth or
-    the ten-thousandth.
+    the ten-thousandth. Samples are evaluated in JAX's precision, sums and steps in float64; without
+    `jax_enable_x64` estimates are rough, and a warning says so, as for `fit`.
 
     Every sample weighs the same, with the noise that is given. Zeros are those of the records: an
     `auto` onset or force offset stays at 0. When a press ends (`press`, `settle`) its record is
@@ -105,7 +106,6 @@ class Online:
         candidates: ArrayLike | None = None,
         samples: int = 50,
         criterion: Criterion = "D",
-        float32: bool = False,
     ):
         """Compile.
 
@@ -118,24 +118,24 @@ class Online:
             candidates: where it may be, mm; (C,). None: 25 places from the first to the last ring.
             samples: that it will have.
             criterion: by which its place is chosen, see `inference.design.choice.scores`.
-            float32: evaluate in single precision; sums and steps are of double precision.
 
         Raises:
             ValueError: an option, a noise or a parameter that only a fit of whole curves can treat;
                 a candidate off the tube; a depth or a number of samples that is none.
         """
-        check_precision(Settings(float32=float32))
+        check_precision(Settings())
         check_word("criterion", criterion, Criterion)
         if samples < 1:
             raise InputError(f"is {samples}", key="samples", expected="1 or more", joint=" ")
-        _check(options, noise)
+        check(options, noise)
         self._given = geometry, options, parameters, noise
-        study, self._size = _template(*self._given), Size.of(geometry)
-        self._candidates = _candidates(study, candidates, depth)
+        study, self._size = blank_study(*self._given), Size.of(geometry)
+        self._candidates = places_of(study, candidates, depth)
         self._samples, self._criterion = samples, criterion
-        dtype = np.float32 if float32 else jax.dtypes.canonicalize_dtype(np.float64)
-        self._minimum = GaussNewton(study, np.dtype(dtype))
-        self._ended, self._against = 0, []
+        dtype = np.dtype(jax.dtypes.canonicalize_dtype(np.float64))
+        self._minimum = GaussNewton(study, dtype)
+        self._looked: dict[str, int] = {}
+        self._against: dict[str, str] = {}
         self._gains, self._gains_at = np.zeros(0), np.full(study.size, np.nan)
         self.state = self._known()
 
@@ -202,22 +202,24 @@ class Online:
 
     def study(self) -> Study:
         """The samples as a study for `fit`, with the model and the noise of this stream."""
-        return _study(self.curves, *self._given)
+        return study_of(self.curves, *self._given)
 
     def _look_at_records(self) -> None:
-        """What the records of presses that have ended say against a fit with these zeros."""
-        table, done = self._minimum.stream.study.parameters, self.curves
+        """What the records so far say against a fit with these zeros."""
+        table = self._minimum.stream.study.parameters
         _, options, _, noise = self._given
-        for curve in done[self._ended :]:
+        for curve in self.curves:
+            if self._looked.get(curve.trial) == len(curve.force):
+                continue
+            self._looked[curve.trial], self._against[curve.trial] = len(curve.force), ""
             where = f"press {curve.trial} (s = {curve.s_c:g} mm)"
             if (refused := refusal(curve, self._size, options, table)) is not None:
-                self._against.append(f"{where}: {refused.error.found}")
+                self._against[curve.trial] = f"{where}: {refused.error.found}"
                 continue
             taken = resolved(table, [curve], options, noise.force).taken
             if names := sorted(taken.get((SPECIMEN, curve.trial), ())):
                 shown = " and ".join(names)
-                self._against.append(f"{where} shows {shown}, held at 0 here; {_CURE}")
-        self._ended = len(done)
+                self._against[curve.trial] = f"{where} shows {shown}, held at 0 here; {CURE}"
 
     def _known(self, status: FitStatus = FitStatus.CONVERGED) -> OnlineState:
         """Errors, verdicts and the next place at the estimate."""
@@ -230,14 +232,14 @@ class Online:
         code = np.array([status if minimum.finite else FitStatus.NON_FINITE])
         status = FitStatus(int(final_status(code, errors, at_bound, count - np.sum(~at_bound))[0]))
         misses, open_ = bool(worth.misses[0]), minimum.structure.undetermined
-        words = ["failed"] * study.size
+        message, words = "; ".join(filter(None, self._against.values())), ["failed"] * study.size
         if status.succeeded:
             doubt = local_doubt(study, errors, minimum.natural, ~open_, at_bound)
             columns = (errors.se / relative * worth.growth, open_, at_bound, doubt)
             words = [
                 verdict(
                     float(error), structural=bool(o), held=bool(held), misses=misses,
-                    unseen=bool(cause or self._against),
+                    unseen=bool(cause or message),
                 )
                 for error, o, held, cause in zip(*(v[0] for v in columns), strict=True)
             ]  # fmt: skip
@@ -250,8 +252,8 @@ class Online:
             names=tuple(p.name for p, _, _ in study.unknowns[0]), value=value,
             standard_error=se * np.where(log, value, step), relative_error=se / relative[0],
             covariance=errors.covariance[0], verdict=tuple(words),
-            next_point=None if misses else self._next(float(worth.factor[0]) if count else 1.0),
-            samples=int(count[0]), status=status, message="; ".join(self._against),
+            next_point=self._next(float(worth.factor[0]) if told else 1.0),
+            samples=int(count[0]), status=status, message=message,
         )  # fmt: skip
 
     def _next(self, factor: float) -> float:
@@ -273,61 +275,3 @@ class Online:
             self._gains, self._gains_at = gains(known, self._candidates), minimum.theta
         score = scores_after(known, self._gains, self._criterion)
         return float(self._candidates.s[np.argmax(score)])
-
-
-def _check(options: Options, noise: Noise) -> None:
-    """Refuse what takes whole curves, or more than forces on the midline."""
-    level = level_of(options)
-    if level.closed is None or level.relaxes:
-        name = "relaxation" if level.relaxes else "skeleton"
-        raise InputError(
-            f"is {getattr(options, name)!r}, which is not fitted sample by sample",
-            key=f"options.{name}", expected="an elastic line of joints", cure=_CURE, joint=" ",
-        )  # fmt: skip
-    if noise.force is None:
-        cure = "take the standard deviation of a record at rest"
-        raise InputError("is None", key="noise.force", expected="a number, N", cure=cure, joint=" ")
-    for name in ("joints", "force_share"):
-        if value := getattr(noise, name):
-            found = f"is {value}"
-            raise InputError(found, key=f"noise.{name}", expected="None", cure=_CURE, joint=" ")
-
-
-def _study(curves, geometry, options, parameters, noise) -> Study:
-    weighting = Weighting(balance="sample")
-    return build_study(curves, geometry, options, parameters, noise=noise, weighting=weighting)
-
-
-def _template(
-    geometry: Geometry, options: Options, parameters: Table | None, noise: Noise
-) -> Study:
-    """A study of one curve that shows nothing: the model and its unknowns."""
-    depth = np.linspace(0, 1, BLOCK)
-    middle = 0.5 * float(geometry.length)
-    curve = Curve(SPECIMEN, "1", middle, 0.0, depth, 100 * (noise.force or 1.0) * depth)
-    study = _study([curve], geometry, options, parameters, noise)
-    if own := [p.name for p in study.free if p.scope == "trial"]:
-        raise InputError(
-            "belongs to single presses, and is not fitted sample by sample",
-            key=f"parameters.{own[0]}", expected="scope 'specimen', or a fixed value", cure=_CURE,
-            joint=" ",
-        )  # fmt: skip
-    if not study.free:
-        raise InputError("every parameter is fixed", key="parameters", expected="a free one")
-    return study
-
-
-def _candidates(study: Study, places: ArrayLike | None, depth: float) -> Candidates:
-    """Presses to choose the next one from."""
-    if not 0 < depth < np.inf:
-        raise InputError(f"is {depth}", key="depth", expected="a length in mm, above 0", joint=" ")
-    geometry = study.model.geometry
-    low, high = study.model.options.places(float(geometry.length))
-    if places is None:
-        rings = np.asarray(geometry.ring_positions)
-        places = np.linspace(max(rings[0], low), min(rings[-1], high), PLACES)
-    s = np.asarray(places, float)
-    if s.ndim != 1 or not s.size or not ((s >= low) & (s <= high)).all():
-        expected = f"positions in mm, (C,), from {low:g} to {high:g} mm"
-        raise InputError(f"{places}", key="candidates", expected=expected)
-    return Candidates(s, np.full(len(s), float(depth)))
