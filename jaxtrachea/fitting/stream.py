@@ -155,7 +155,8 @@ class Stream:
         if not self._sweeping:
             self._next.point, self._sweeping = theta, True
             self._next.fresh[:] = False
-        new, left = (np.flatnonzero(~e.fresh[: self._count]) for e in (self._now, self._next))
+        both = self._now, self._next
+        new, left = (np.flatnonzero(~e.fresh[: self._count]).tolist() for e in both)
         slots = TOGETHER * (len(new) // TOGETHER + 1) - len(new)
         jobs = [(self._now, b) for b in new] + [(self._next, b) for b in left[:slots]]
         for first in range(0, len(jobs), TOGETHER):

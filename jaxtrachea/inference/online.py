@@ -34,6 +34,7 @@ from jaxtrachea.inference.online_model import (
     SPECIMEN,
     blank_study,
     check,
+    deepest,
     places_of,
     study_of,
 )
@@ -130,7 +131,7 @@ class Online:
         check(options, noise)
         self._given = geometry, options, parameters, noise
         study, self._size = blank_study(*self._given), Size.of(geometry)
-        self._candidates = places_of(study, candidates, depth)
+        self._candidates, self._deepest = places_of(study, candidates, depth), deepest(study)
         self._samples, self._criterion = samples, criterion
         dtype = np.dtype(jax.dtypes.canonicalize_dtype(np.float64))
         self._minimum = GaussNewton(study, dtype)
@@ -151,7 +152,7 @@ class Online:
         self._look_at_records()
         self._minimum.begin(float(s))
 
-    def add(self, displacement: ArrayLike, force: ArrayLike) -> OnlineState:
+    def add(self, displacement: float | ArrayLike, force: float | ArrayLike) -> OnlineState:
         """Take samples of the present press.
 
         Args:
@@ -160,7 +161,7 @@ class Online:
 
         Raises:
             ValueError: no press has begun; numbers that are not finite, or not as many of both;
-                the samples are not taken.
+                deeper than the radius of the tube. The samples are not taken.
         """
         d, f = (np.atleast_1d(np.asarray(v, float)) for v in (displacement, force))
         if not self._minimum.stream.lengths:
@@ -173,6 +174,9 @@ class Online:
             if not np.isfinite(v).all():
                 found = f"is {v[~np.isfinite(v)][0]}"
                 raise InputError(found, key=name, expected="finite numbers", joint=" ")
+        if (most := np.max(np.abs(d))) > self._deepest:
+            found, expected = f"is {most:g} mm", f"at most the radius, {self._deepest:g} mm"
+            raise InputError(found, key="displacement", expected=expected, joint=" ")
         self._minimum.append(d, f)
         self.state = self._known()
         return self.state

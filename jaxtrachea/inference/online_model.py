@@ -78,6 +78,13 @@ def blank_study(
     return study
 
 
+def deepest(study: Study) -> float:
+    """Displacement at most, mm: a tube is pressed no deeper than its radius."""
+    # Without a skeleton the specimen need not be a tube.
+    tube = study.model.options.coupling == "series"
+    return float(study.model.geometry.radius) if tube else np.inf
+
+
 def places_of(study: Study, places: ArrayLike | None, depth: float) -> Candidates:
     """Presses to choose the next one from.
 
@@ -89,8 +96,9 @@ def places_of(study: Study, places: ArrayLike | None, depth: float) -> Candidate
     Raises:
         InputError: a depth that is none, or a place off the tube.
     """
-    if not 0 < depth < np.inf:
-        raise InputError(f"is {depth}", key="depth", expected="a length in mm, above 0", joint=" ")
+    if not (0 < depth < np.inf and depth <= deepest(study)):
+        most = f"above 0 and at most the radius, {deepest(study):g} mm"
+        raise InputError(f"is {depth}", key="depth", expected=most, joint=" ")
     geometry = study.model.geometry
     low, high = study.model.options.places(float(geometry.length))
     if places is None:
