@@ -9,6 +9,7 @@ from .fitting.study import Study as Study
 from .fitting.study import build_study as build_study
 from .fusion import fuse as fuse
 from .inference.bootstrap import bootstrap as bootstrap
+from .inference.online import Online as Online
 from .inference.profile import profiles as profiles
 from .measurements.curve import Curve as Curve
 from .measurements.curve import ReadOptions as ReadOptions

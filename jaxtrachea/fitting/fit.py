@@ -258,7 +258,7 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     unit = precision_unit(study)
     samples = np.sum(info.counts, axis=1)
     left = np.sum(pool.counts, axis=1) - (np.sum(~held, axis=1) if unknowns is None else unknowns)
-    status = _final_status(solved.status, u, at_bound, left)
+    status = final_status(solved.status, u, at_bound, left)
     return FitResult(
         study=study, theta=theta, value=value, standard_error=standard_error,
         lower=lower, upper=upper, relative_se=u.se / relative,
@@ -285,7 +285,7 @@ def _open_directions(study: Study, theta, structure: Structure) -> np.ndarray:
     return out
 
 
-def _final_status(status, u: Uncertainty, at_bound, dof) -> np.ndarray:
+def final_status(status, u: Uncertainty, at_bound, dof) -> np.ndarray:
     """What the solver said, and for what it solved: too few data, undetermined, on a bound."""
     solved = status <= FitStatus.UNIDENTIFIABLE
     fine = np.where(np.any(at_bound, axis=1), FitStatus.AT_BOUND, FitStatus.CONVERGED)

@@ -8,6 +8,7 @@ elsewhere.
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.minima import Minima
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.parameters import OF_THE_PRESS, SKELETON
@@ -39,24 +40,44 @@ def needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P
     """
     alive = np.isin(result.status, _SITUATED)
     present = (result.study.lanes.active > 0) & ~result.undetermined & alive[:, None]
-    doubt = np.zeros(present.shape, bool)
-    natural = natural_sizes(result)
+    natural = natural_sizes(result.study, result.relative, result.first_touch)
+    doubt = local_doubt(result.study, result.uncertainty, natural, present, result.at_bound)
     se = result.uncertainty.se / natural
+    se = np.where(present & np.isfinite(se), se, 0)
+    failed = result.status > FitStatus.UNIDENTIFIABLE
+    everything = failed | _elsewhere_as_low(result, minima, se, natural)
+    return present & (doubt | everything[:, None])
+
+
+def local_doubt(
+    study: Study,
+    uncertainty: Uncertainty,
+    natural: Float[np.ndarray, "lanes P"],
+    present: Bool[np.ndarray, "lanes P"],
+    at_bound: Bool[np.ndarray, "lanes P"],
+) -> Bool[np.ndarray, "lanes P"]:
+    """Unknowns that give cause by what is known at the estimate alone, without other starts.
+
+    Args:
+        study: the study.
+        uncertainty: at the estimate.
+        natural: from `natural_sizes`.
+        present: unknowns that are asked about.
+        at_bound: unknowns on a bound.
+    """
+    se = uncertainty.se / natural
     known = present & np.isfinite(se)
     se = np.where(known, se, 0)
-    correlation = result.uncertainty.correlation
     both = known[:, :, None] & known[:, None]
-    covariance = np.where(both, correlation, 0) * se[:, :, None] * se[:, None]
+    covariance = np.where(both, uncertainty.correlation, 0) * se[:, :, None] * se[:, None]
     values, vectors = np.linalg.eigh(np.nan_to_num(covariance))
     root = np.sqrt(np.maximum(values, 0))
     least = np.min(np.where(np.sum(vectors**2 * known[:, :, None], axis=1) > 0.5, root, np.inf), 1)
     long = (root > LONG) | (root > ILL_CONDITIONED * least[:, None])
-    doubt |= np.any(long[:, None] & (np.abs(vectors) * root[:, None] > PART), axis=2)
-    failed = result.status > FitStatus.UNIDENTIFIABLE
-    lost = present & ~np.isfinite(se + np.where(known, 0, np.inf)) & ~result.at_bound
-    everything = result.at_bound.any(axis=1) | lost.any(axis=1) | failed
-    everything |= root.max(axis=1) > VERY_LONG
-    everything |= _elsewhere_as_low(result, minima, se, natural) | barely_determined(result.study)
+    doubt = np.any(long[:, None] & (np.abs(vectors) * root[:, None] > PART), axis=2)
+    lost = present & ~known & ~at_bound
+    everything = at_bound.any(axis=1) | lost.any(axis=1) | (root.max(axis=1) > VERY_LONG)
+    everything |= barely_determined(study)
     return present & (doubt | everything[:, None])
 
 
@@ -76,7 +97,8 @@ def still_needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "l
         doubt[row, shared] = np.mean(votes, axis=0) >= 0.5 if len(votes) else True
     if not any(p.name in OF_THE_PRESS for p in study.free):
         return doubt
-    error = result.uncertainty.se / natural_sizes(result)
+    natural = natural_sizes(result.study, result.relative, result.first_touch)
+    error = result.uncertainty.se / natural
     for lane, unknowns in enumerate(study.unknowns):
         for i, (p, _, _) in enumerate(unknowns):
             if p.name in OF_THE_PRESS:
@@ -118,25 +140,32 @@ def barely_determined(study: Study) -> Bool[np.ndarray, " lanes"]:
     return (positions(study) <= count + 1) & (count > 1) & ~seen
 
 
-def natural_sizes(result: FitResult) -> Float[np.ndarray, "L P"]:
+def natural_sizes(
+    study: Study, relative: Float[np.ndarray, "L P"], first_touch: Float[np.ndarray, "L T"]
+) -> Float[np.ndarray, "L P"]:
     """Change of each scaled coordinate that matters to the curves as a change of 100 % would.
 
     As `FitResult.relative`, but no smaller than the press itself for what may be zero: an onset
     against the deepest displacement from first touch, an offset against the largest force, a
     coefficient k_n of the local law against that force over the depth to the power n.
+
+    Args:
+        study: the study.
+        relative: as `FitResult.relative`.
+        first_touch: as `FitResult.first_touch`, mm.
     """
-    lanes, out = result.study.lanes, result.relative.copy()
+    lanes, out = study.lanes, relative.copy()
     seen = lanes.precision > 0
     force = np.where(seen, np.abs(lanes.force), 0).max(axis=(1, 2))
-    depth = np.abs(lanes.displacement - result.first_touch[..., None])
+    depth = np.abs(lanes.displacement - first_touch[..., None])
     depth = np.where(seen, depth, 0).max(axis=(1, 2))
     depth = np.where(depth > 0, depth, 1)
     sizes = {"onset": depth, "force_offset": force, "force_slope": force / depth}
-    law = [p.name for p in result.study.free if coefficient(p.name)]
+    law = [p.name for p in study.free if coefficient(p.name)]
     sizes |= {name: force / depth ** power(name) for name in law if power(name) > 1}
-    for column, p in enumerate(result.study.free):
+    for column, p in enumerate(study.free):
         if p.scale == "linear" and p.name in sizes:
-            lane, unknown = np.nonzero(result.study.unknown_columns == column)
+            lane, unknown = np.nonzero(study.unknown_columns == column)
             own = sizes[p.name][lane] / p.step
             before = out[lane, unknown]
             out[lane, unknown] = np.where(own > before, own, before)  # NaN takes no place

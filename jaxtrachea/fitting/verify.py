@@ -156,7 +156,8 @@ def _other_minima(region: _Region, lanes, known: Structure) -> Int[np.ndarray, "
     )
     within = region.add(np.tile(lanes, len(starts)), theta, cost).reshape(len(starts), -1)
     theta = theta.reshape(len(starts), len(lanes), -1)
-    natural = natural_sizes(region.result)
+    result = region.result
+    natural = natural_sizes(result.study, result.relative, result.first_touch)
     ends = (theta[within[:, n], n] for n in range(len(lanes)))
     return np.array(
         [

@@ -173,5 +173,12 @@ def _prior(study: Study, lane: Int[np.ndarray, " G"], theta: Float[np.ndarray, "
     """Change that makes a relative change of 1, and information of the bounds, of guesses."""
     absent = study.lanes.active[lane] == 0
     relative = np.where(absent, 1.0, relative_change(study.take(lane), theta))
+    return relative, of_bounds(study, lane, relative)
+
+
+def of_bounds(
+    study: Study, lane: Int[np.ndarray, " G"], relative: Float[np.ndarray, "G P"]
+) -> Float[np.ndarray, "G P"]:
+    """Information of the bounds: that of the variance of a uniform distribution between them."""
     width = (study.lanes.upper - study.lanes.lower)[lane] / relative
-    return relative, 12 / np.where(width > 0, width, 1) ** 2
+    return 12 / np.where(width > 0, width, 1) ** 2
