@@ -1,7 +1,7 @@
 """A simulation as an animated GLB (glTF 2.0): it plays in viewers, slides and browsers.
 
 Format: Khronos glTF 2.0, ISO/IEC 12113:2022. The wall is a mesh with a morph target for each row,
-the tool a node that moves. Lengths are in metres, as glTF wants; y is anterior and up.
+each tool a node that moves. Lengths are in metres, as glTF wants; y is anterior and up.
 """
 
 import json
@@ -72,13 +72,15 @@ def write_glb(path: Path, recording: Recording) -> None:
     times = recording.times[rows] - recording.times[rows[0]]
     clock = buffer.add(times / (1 if recording.timed else ROWS_A_SECOND), bounds=True)
     moves = [(0, "weights", np.eye(len(rows)).ravel())]
-    if recording.tool is not None:
-        meshes.append({"name": "tool", "primitives": [_tool(buffer, recording.tool)]})
-        turns = _quaternions(recording.rotation[rows])
-        shifts = recording.translation[rows] / 1e3
-        nodes.append({"name": "tool", "mesh": 1, "rotation": turns[0].tolist(),
+    for tool in recording.tools:
+        if tool.triangles is None:
+            continue
+        meshes.append({"name": tool.name, "primitives": [_tool(buffer, tool.triangles)]})
+        turns, shifts = _quaternions(tool.rotation[rows]), tool.translation[rows] / 1e3
+        nodes.append({"name": tool.name, "mesh": len(nodes), "rotation": turns[0].tolist(),
                       "translation": shifts[0].tolist()})  # fmt: skip
-        moves += [(1, "rotation", turns), (1, "translation", shifts)]
+        number = len(nodes) - 1
+        moves += [(number, "rotation", turns), (number, "translation", shifts)]
     samplers = [{"input": clock, "output": buffer.add(values)} for *_, values in moves]
     channels = [
         {"sampler": i, "target": {"node": node, "path": what}}

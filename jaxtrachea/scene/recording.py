@@ -1,17 +1,40 @@
 """What other programs draw of a simulation: the wall, the tool and the contact, row by row."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.scene.read import StoredSimulation
 from jaxtrachea.scene.solids import Triangles, rings_on, tool_triangles
+from jaxtrachea.scene.stage import Poses
 
 
 class NoSurface(InputError):
     """A simulation without a surface."""
+
+
+class MovingTool(NamedTuple):
+    """A tool, its way and its contact.
+
+    Attributes:
+        name: `tool` where there is but one.
+        triangles: about its own origin, mm; None: presses at given points.
+        rotation: of the tool.
+        translation: of its origin, mm.
+        nearest: vertex of the wall that is nearest to its contact point.
+        at_contact: `force` (N), `s` (mm) and `phi` (rad).
+    """
+
+    name: str
+    triangles: Triangles | None
+    rotation: Float[np.ndarray, "rows 3 3"]
+    translation: Float[np.ndarray, "rows 3"]
+    nearest: Int[np.ndarray, " rows"]
+    at_contact: dict[str, np.ndarray]
 
 
 class Recording(NamedTuple):
@@ -24,11 +47,7 @@ class Recording(NamedTuple):
         faces: triangles of the wall.
         ring: whether a vertex lies on a ring.
         walls: vertices of the wall in each row; None: the row has no solution.
-        nearest: vertex of the wall that is nearest to the contact point of each row.
-        at_contact: `force` (N), `s` (mm) and `phi` (rad) of each row.
-        tool: its triangles about its own origin; None: presses at given points.
-        rotation: of the tool.
-        translation: of the tool's origin.
+        tools: one or several.
     """
 
     times: Float[np.ndarray, " rows"]
@@ -37,17 +56,7 @@ class Recording(NamedTuple):
     faces: Int[np.ndarray, "faces 3"]
     ring: Bool[np.ndarray, " vertices"]
     walls: list[Float[np.ndarray, "vertices 3"] | None]
-    nearest: Int[np.ndarray, " rows"]
-    at_contact: dict[str, np.ndarray]
-    tool: Triangles | None
-    rotation: Float[np.ndarray, "rows 3 3"]
-    translation: Float[np.ndarray, "rows 3"]
-
-    def contact(self, row: int) -> Float[np.ndarray, "3"]:
-        """The deformed wall at the contact point of a solved row."""
-        wall = self.walls[row]
-        assert wall is not None
-        return wall[self.nearest[row]]
+    tools: list[MovingTool]
 
 
 def recording_of(stored: StoredSimulation) -> Recording:
@@ -59,7 +68,7 @@ def recording_of(stored: StoredSimulation) -> Recording:
     Raises:
         NoSurface: it has no surface, or no row was solved.
     """
-    series, rest, path = stored.simulation, stored.rest, stored.path
+    series, rest = stored.simulation, stored.rest
     if rest is None or series.vertices is None:
         raise NoSurface("has no surface", cure="simulate with surface = true in [output]")
     moved = np.asarray(series.vertices, float)
@@ -67,9 +76,15 @@ def recording_of(stored: StoredSimulation) -> Recording:
     if not any(solved):
         raise NoSurface("has no solved row", cure="see the status of its rows")
     rows, time = len(moved), series.time
-    turn = np.asarray(rest["phi"] - np.asarray(series.phi)[:, None] + np.pi) % (2 * np.pi) - np.pi
-    away = np.hypot(rest["s"] - np.asarray(series.s)[:, None], rest["distance"] * turn)
-    placed = path is not None
+    if isinstance(stored.path, Mapping):
+        shapes = stored.tool if isinstance(stored.tool, Mapping) else {}
+        tools = [
+            _moving(name, shapes.get(name), path, stored, i)
+            for i, (name, path) in enumerate(stored.path.items())
+        ]
+    else:
+        assert not isinstance(stored.tool, Mapping)
+        tools = [_moving("tool", stored.tool, stored.path, stored, None)]
     return Recording(
         times=np.arange(float(rows)) if time is None else np.asarray(time, float),
         timed=time is not None,
@@ -77,9 +92,30 @@ def recording_of(stored: StoredSimulation) -> Recording:
         faces=np.asarray(rest["faces"]),
         ring=rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)[0],
         walls=[v if ok else None for v, ok in zip(moved, solved, strict=True)],
+        tools=tools,
+    )
+
+
+def _moving(
+    name: str, shape: Shape | None, path: Poses | None, stored: StoredSimulation, place: int | None
+) -> MovingTool:
+    """A tool; `place`: its number where the series have an axis of tools."""
+    series, rest = stored.simulation, stored.rest
+    assert rest is not None
+
+    def own(field: str) -> np.ndarray:
+        values = np.asarray(getattr(series, field), float)
+        return values if place is None else values[:, place]
+
+    rows, s, phi = len(own("s")), own("s"), own("phi")
+    turn = np.asarray(rest["phi"] - phi[:, None] + np.pi) % (2 * np.pi) - np.pi
+    away = np.hypot(rest["s"] - s[:, None], rest["distance"] * turn)
+    still = path is None
+    return MovingTool(
+        name=name,
+        triangles=None if shape is None else tool_triangles(shape),
+        rotation=np.tile(np.eye(3), (rows, 1, 1)) if still else np.asarray(path.rotation),
+        translation=np.zeros((rows, 3)) if still else np.asarray(path.translation),
         nearest=np.nan_to_num(away, nan=np.inf).argmin(axis=1),
-        at_contact={n: np.asarray(getattr(series, n), float) for n in ("force", "s", "phi")},
-        tool=None if stored.tool is None else tool_triangles(stored.tool),
-        rotation=np.asarray(path.rotation) if placed else np.tile(np.eye(3), (rows, 1, 1)),
-        translation=np.asarray(path.translation) if placed else np.zeros((rows, 3)),
+        at_contact={"force": own("force"), "s": s, "phi": phi},
     )

@@ -18,10 +18,10 @@ _KINDS = {"f": ("Float32", "<f4"), "i": ("Int32", "<i4"), "u": ("UInt8", "u1")}
 
 
 def write_vtk(folder: Path, recording: Recording) -> None:
-    """Write `simulation.pvd`, and below `vtk/` a wall, a tool and a contact point for each row.
+    """Write `simulation.pvd`, and below `vtk/` wall, tools and contact points for each row.
 
     Lengths are in mm, times in s, or numbers of rows where the path has no time. A row without a
-    solution has its tool alone. The wall has `displacement` (mm) and `ring` (1 on a ring), the
+    solution has its tools alone. The wall has `displacement` (mm) and `ring` (1 on a ring), the
     contact point `force` (N), `s` (mm) and `phi` (rad).
 
     Args:
@@ -33,6 +33,9 @@ def write_vtk(folder: Path, recording: Recording) -> None:
     """
     (folder / "vtk").mkdir()
     sets = []
+    names = [("tool", "contact")]
+    if len(recording.tools) > 1:  # names may hold what files cannot
+        names = [(f"tool_{i + 1}", f"contact_{i + 1}") for i in range(len(recording.tools))]
 
     def add(row: int, part: int, name: str, text: str) -> None:
         path = f"vtk/{name}_{row + 1:04d}.vtp"
@@ -44,13 +47,15 @@ def write_vtk(folder: Path, recording: Recording) -> None:
         if (wall := recording.walls[row]) is not None:
             point = {"displacement": wall - recording.rest, "ring": recording.ring.astype(np.uint8)}
             add(row, 0, "wall", _surface(wall, recording.faces, point))
-        if recording.tool is not None:
-            corners, faces = recording.tool
-            placed = corners @ recording.rotation[row].T + recording.translation[row]
-            add(row, 1, "tool", _surface(placed, faces, {}))
-        if wall is not None:
-            at = {name: v[row : row + 1] for name, v in recording.at_contact.items()}
-            add(row, 2, "contact", _surface(recording.contact(row)[None], None, at))
+        for part, tool in enumerate(recording.tools):
+            if tool.triangles is not None:
+                corners, faces = tool.triangles
+                placed = corners @ tool.rotation[row].T + tool.translation[row]
+                add(row, 1 + 2 * part, names[part][0], _surface(placed, faces, {}))
+            if wall is not None:
+                at = {name: v[row : row + 1] for name, v in tool.at_contact.items()}
+                point = wall[tool.nearest[row]][None]
+                add(row, 2 + 2 * part, names[part][1], _surface(point, None, at))
     body = "\n".join(sets)
     write_text(
         folder / "simulation.pvd", _file("Collection", f"<Collection>\n{body}\n</Collection>")

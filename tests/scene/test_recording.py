@@ -201,8 +201,7 @@ def test_a_long_path_has_few_shapes_and_one_row_is_enough(tmp_path):
     given = recording_of(stored())
     wall = given.walls[1]
     long = given._replace(
-        times=np.arange(float(rows)), walls=[wall] * rows, tool=None,
-        rotation=np.tile(np.eye(3), (rows, 1, 1)), translation=np.zeros((rows, 3)),
+        times=np.arange(float(rows)), walls=[wall] * rows, tools=[],
     )  # fmt: skip
     write_glb(tmp_path / "long.glb", long)
     document, _ = chunks(tmp_path / "long.glb")
@@ -212,6 +211,25 @@ def test_a_long_path_has_few_shapes_and_one_row_is_enough(tmp_path):
     assert [node["name"] for node in document["nodes"]] == ["trachea"]
     write_glb(tmp_path / "one.glb", recording_of(stored(solved=(False, True, False, False))))
     assert len(trimesh.load(tmp_path / "one.glb", process=False).geometry) == 2
+
+
+def test_several_tools_move_by_themselves(tmp_path):
+    """Each its own node, file and contact point; one of them presses at points and is not seen."""
+    one = stored()
+    series, both = one.simulation, {"left": one.path, "right": one.path}
+    twice = {n: np.stack([getattr(series, n)] * 2, axis=1) for n in ("s", "phi", "force")}
+    twice["s"][:, 1] = 36.0
+    given = one._replace(
+        simulation=series._replace(**twice), path=both, tool={"left": one.tool, "right": None}
+    )
+    recording = recording_of(given)
+    write_glb(tmp_path / "a.glb", recording)
+    document, _ = chunks(tmp_path / "a.glb")
+    assert [node["name"] for node in document["nodes"]] == ["trachea", "left"]
+    write_vtk(tmp_path, recording)
+    names = {p.name.rpartition("_")[0] for p in (tmp_path / "vtk").iterdir()}
+    assert names == {"wall", "tool_1", "contact_1", "contact_2"}
+    assert [given.rest["s"][tool.nearest[1]] for tool in recording.tools] == [20.0, 36.0]
 
 
 def test_what_has_no_surface_is_refused():
