@@ -232,12 +232,13 @@ def test_a_whole_record_is_drawn_along_its_time(one):
     assert named == ["s060", "s060 again"]
 
 
-def test_captions_follow_what_was_observed(one, dense_result):
-    assert list(captions(one)) == ["fit", "residuals", "correlation"]
-    assert list(captions(dense_result)) == ["fit", "joints", "residuals", "correlation"]
+def test_captions_follow_what_was_observed(one, many, dense_result):
+    assert list(captions(many)) == ["fit", "residuals", "correlation"]
+    assert list(captions(one)) == ["fit", "correlation"]
+    assert list(captions(dense_result)) == ["fit", "joints", "correlation"]
     seen = dataclasses.replace(one.residuals, side_force=one.residuals.force)
     both = dataclasses.replace(one, stored_residuals=seen)
-    assert list(captions(both)) == ["fit", "side_force", "residuals", "correlation"]
+    assert list(captions(both)) == ["fit", "side_force", "correlation"]
 
 
 def test_curves_left_out_are_drawn_as_they_are_predicted(one):

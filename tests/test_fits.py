@@ -64,14 +64,14 @@ def test_run_writes_every_file_and_the_plots_decode(folder):
         *("results.h5", "summary.csv", "parameters.csv", "report.md", "report.html"),
         *("curves.csv", "left_out.csv"),
         "provenance.json",
-        *("fit.png", "residuals.png", "correlation.png"),
+        *("fit.png", "joints.png", "correlation.png", "left_out.png"),
     }
     for path in folder.glob("*.png"):
         image = matplotlib.image.imread(path)
         assert min(image.shape[:2]) > 200
         assert np.std(image[..., :3]) > 0.01
     report = (folder / "report.md").read_text()
-    assert all(f"]({name}.png)" in report for name in ("fit", "residuals", "correlation"))
+    assert all(f"]({name}.png)" in report for name in ("fit", "joints", "left_out"))
     # EI_L is known to 6 %: more than 5 %, so the report says with what it goes together.
     (weakest,) = (line for line in report.splitlines() if "together" in line)
     assert "EI_L" in weakest

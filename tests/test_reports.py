@@ -413,7 +413,7 @@ def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
     assert "Leaving one curve out" in out
     assert "Influence of curves" in out
     names = {p.name for p in Path("o").iterdir()}
-    assert {"fit.png", "residuals.png", "correlation.png", "left_out.csv"} <= names
+    assert {"fit.png", "left_out.png", "correlation.png", "left_out.csv"} <= names
     assert len(read_csv(Path("o/left_out.csv"))) == 6
     parameters = read_csv(Path("o/parameters.csv"))
     assert {row["specimen"] for row in parameters} == {"$a$ $b$", r"$\frac{$", "=1+1"}

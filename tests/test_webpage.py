@@ -143,7 +143,7 @@ def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
     assert read.headings[:2] == [headings[0], "Pictures"]
     assert set(read.headings) == {*headings, "Provenance", "Explorer"}
     assert len(read.tables) == text.count("\n| --- ") + 2
-    assert sum(link.startswith("data:image/png") for link in read.links) == text.count("![") == 3
+    assert sum(link.startswith("data:image/png") for link in read.links) == text.count("![") == 2
     beside = {path.name for path in Path("out").iterdir()}
     assert {"influence.csv", "summary.csv", "results.h5"} <= beside & set(read.links)
     inside = [link.removeprefix("#") for link in read.links if link.startswith("#")]

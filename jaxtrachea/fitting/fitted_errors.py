@@ -77,21 +77,19 @@ def _slopes(result: FitResult, lanes) -> dict[str, Float[np.ndarray, "F n T ..."
     if not count:
         return {}
     step = STEP * result.relative[lanes]
-    mine = study.unknown_columns[lanes] == np.arange(count)[:, None, None]
-    up_down = np.where(mine, step, 0)[:, None] * np.array([1, -1])[:, None, None]
-    up_down = result.theta[lanes] + up_down
-    many = study.take(np.tile(lanes, 2 * count))
-    found = predictions(many, up_down.reshape(-1, up_down.shape[-1]), like=result.lanes)
     width = 2 * np.where(read, step[rows[..., None], place], 1)
-    slopes = {}
-    for kind in forces(study.lanes) + markers(study.lanes):
-        ends = getattr(found, kind.name)
-        ends = ends.reshape(count, 2, len(lanes), *ends.shape[1:])
-        over = np.moveaxis(width, 2, 0)
-        slopes[kind.name] = (ends[:, 0] - ends[:, 1]) / over.reshape(
-            *over.shape, *(1,) * (ends.ndim - 4)
-        )
-    return slopes
+    kinds = forces(study.lanes) + markers(study.lanes)
+    twice, slopes = study.take(np.tile(lanes, 2)), {kind.name: [] for kind in kinds}
+    for f in range(count):
+        move = np.where(study.unknown_columns[lanes] == f, step, 0)
+        ends = np.concatenate([result.theta[lanes] + move, result.theta[lanes] - move])
+        found = predictions(twice, ends, like=result.lanes)
+        for name, parts in slopes.items():
+            up, down = np.split(getattr(found, name), 2)
+            parts.append(
+                (up - down) / width[..., f].reshape(*place.shape[:2], *[1] * (up.ndim - 2))
+            )
+    return {name: np.stack(parts) for name, parts in slopes.items()}
 
 
 def _covariance(result: FitResult, lanes) -> Float[np.ndarray, "n T F F"]:

@@ -14,7 +14,8 @@ def captions(result: FitResult) -> dict[str, str]:
         found["joints"] = "markers at the largest displacement, and fit"
     if few and seen.side_force is not None:
         found["side_force"] = "side force and fit"
-    found["residuals"] = "residuals of the force"
+    if not few:  # else they stand under the curves
+        found["residuals"] = "residuals of the force"
     if result.study.free:
         found["correlation"] = "correlation of the estimates"
     return found

@@ -55,8 +55,7 @@ def draw_force(shown: Shown, name: str = "force"):
         order = np.arange(len(x)) if curve.rise else np.argsort(x, kind="stable")
         point = lane, t, slice(len(x))
         off, half, over = (v[: len(x)] for v in shown.errors_at(name, *point))
-        used = np.isfinite(off)
-        parts = np.where(used, data, np.nan), np.where(used, np.nan, data), data + off, half, over
+        parts = data, np.full(len(x), np.nan), data + off, half, over
         return Trace(x[order], *(v[order] for v in parts))
 
     traces = [[(t, trace(p.lane, t)) for t in p.trials] for p in shown.panels]
@@ -69,6 +68,7 @@ def draw_joints(shown: Shown):
     The line is the fit where it was compared.
     """
     study = shown.result.study
+    precision = np.asarray(study.lanes.joint_precision)
     rings = np.asarray(study.model.geometry.ring_positions, float)
 
     def trace(lane: int, t: int) -> Trace | None:
@@ -79,7 +79,7 @@ def draw_joints(shown: Shown):
         D, measured = curve.displacement[last] or np.nan, np.full(rings.shape, np.nan)
         measured[curve.joint_rings] = curve.joint_displacement[last]
         off, half, over = shown.errors_at("joints", lane, t, last)
-        used = np.isfinite(off)
+        used = precision[lane, t, last] > 0
         first, second = np.where(used, measured, np.nan), np.where(used, np.nan, measured)
         return Trace(rings, first / D, second / D, (measured + off) / D, half / abs(D), over)
 
@@ -191,8 +191,7 @@ def draw_residual(axis, x, studentised, limit: float, look: dict[str, Any]) -> b
 def _alike(rows: list) -> bool:
     """Whether panels may share their limits: no one has far larger values than the usual one."""
     largest = [
-        np.nanmax(np.abs(np.concatenate([np.append(t.measured, t.fitted) for _, t in row])))
-        for row in rows
+        max(np.nanmax(np.abs([t.measured, t.fitted]), initial=0.0) for _, t in row) for row in rows
     ]
     return bool(max(largest) <= _ALIKE * np.median(largest))
 

@@ -105,15 +105,15 @@ def _number(upper, lower, ends, shifts, label: str, *, numbers: bool) -> None:
     """Limits, ticks and label of panels beside each other in one pair of axes."""
     low, high = ends
     gap = 0.5 * _GAP * (high - low)
-    ticks = MaxNLocator(3).tick_values(low, high)
-    ticks = ticks[(ticks >= low) & (ticks <= high)]
-    lower.set_xticks((ticks + shifts[:, None]).ravel(), [f"{v:g}" for v in ticks] * len(shifts))
+    if numbers:
+        ticks = MaxNLocator(3).tick_values(low, high)
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        lower.set_xticks((ticks + shifts[:, None]).ravel(), [f"{v:g}" for v in ticks] * len(shifts))
+        lower.set_xlabel(label, fontsize=8)
+    else:
+        lower.xaxis.set_major_locator(NullLocator())
     for axis in (upper, lower):
         axis.set_xlim(low - gap, high + gap + shifts[-1])
         if len(shifts) > 1:
             edges = shifts[1:] + low - gap
             axis.vlines(edges, 0, 1, transform=axis.get_xaxis_transform(), color="0.7", lw=0.6)
-    if numbers:
-        lower.set_xlabel(label, fontsize=8)
-    else:
-        lower.tick_params(axis="x", labelbottom=False, length=0)

@@ -56,7 +56,7 @@ def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
     assert code == 0, err
     assert "nothing was fitted" in said
     names = {"results.h5", "summary.csv", "parameters.csv", "report.md", "report.html", "fit.png",
-             "residuals.png", "provenance.json"}  # fmt: skip
+             "provenance.json"}  # fmt: skip
     assert names <= set(tree(out))
     assert "correlation.png" not in tree(out)
     report = (out / "report.md").read_text()

@@ -183,8 +183,8 @@ def _mark_interval(axis, found: Profiles, k: int) -> str:
     axis.axvline(value, color="k", lw=0.8, label="estimate")
     ends = [float(v[k]) for v in (found.lower, found.upper)]
     low, high = (p.from_scaled(float(v)) for v in found.coordinate[k][[0, -1]])
-    shown = [e if np.isfinite(e) and e > 0 or p.scale != "log" else d
-             for e, d in zip(ends, (low, high), strict=True)]  # fmt: skip
+    open_low = ends[0] == (0 if p.scale == "log" else -np.inf)
+    shown = low if open_low else ends[0], high if ends[1] == np.inf else ends[1]
     if np.isfinite(shown).all():
         axis.axvspan(*shown, color="0.5", alpha=0.18, lw=0, label="95 % interval")
     se = result.uncertainty.se[lane, i]
