@@ -153,7 +153,6 @@ LONGEST = (
 LONGEST_SLOW = (
     "test_verify.py",
     "test_full_disk.py",
-    "test_processes.py",
     "test_resume.py",
     "test_press_derivatives.py",
     "test_section_analyses.py",
