@@ -98,8 +98,9 @@ def with_omitted_zeros(
         progress: as for `fit`.
     """
     alive = None if progress is None else lambda done, of: progress(0, of)
+    rows = np.arange(result.lanes)  # who asked for nothing does not later
     for _ in range(MORE_ZEROS):
-        if study.recipe is None or not (asked := asked_for(result)).names:
+        if study.recipe is None or not (asked := asked_for(result, rows)).names:
             break
         study = with_zeros(study, asked.names)
         near = near_estimates(result, study, asked)
