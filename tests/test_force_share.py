@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from jaxtrachea.fitting.evaluate import evaluated
-from jaxtrachea.fitting.force_share import Levels, _most_likely, changed, with_levels
+from jaxtrachea.fitting.force_share import (
+    Levels,
+    _most_likely,
+    changed,
+    with_found_shares,
+    with_levels,
+)
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
@@ -107,3 +113,32 @@ def test_a_share_that_was_found_is_kept_with_the_fit(tmp_path):
     assert both.force_share.tolist() == [0, 0.05]
     np.testing.assert_array_equal(both.study.lanes.precision[0], plain.lanes.precision[0])
     assert result_of(plain, arrays_of(none)).study.force_share is None  # no refit looks again
+
+
+def test_lanes_that_were_fitted_again_bring_their_shares():
+    """As if all had been found together; without any share none is looked for once more."""
+    D = np.linspace(0, 6.0, 20)
+    curves = [Curve(name, "1", s_c=75.0, phi_c=0.0, displacement=D, force=slope * D)
+              for name, slope in (("A", 0.5), ("B", 0.7), ("C", 0.9))]  # fmt: skip
+    whole, rows = build_study(curves, table_1(), noise=Noise(force_share="estimate")), np.array([1])
+    force, sigma = np.asarray(whole.lanes.force), np.array([0.02, 0.03, 0.04])
+
+    def found(study, of, share):
+        return with_levels(study, Levels(sigma[of], np.array(share)), force[of])
+
+    every = np.arange(3)
+    before, part = found(whole, every, [0.01, 0.0, 0.02]), whole.take(rows)
+    together = found(whole, every, [0.01, 0.05, 0.02])
+    out = with_found_shares(whole, before, rows, found(part, rows, [0.05]))
+    np.testing.assert_array_equal(out.lanes.precision, together.lanes.precision)
+    for value, expected in zip(out.shares, together.shares, strict=True):
+        np.testing.assert_array_equal(value, expected)
+
+    none = dataclasses.replace(whole, force_share=None)
+    out = with_found_shares(whole, before, rows, dataclasses.replace(part, force_share=None))
+    np.testing.assert_array_equal(out.lanes.precision, before.lanes.precision)
+    out = with_found_shares(whole, none, rows, found(part, rows, [0.05]))
+    np.testing.assert_array_equal(out.shares.share, [0, 0.05, 0])
+    np.testing.assert_array_equal(out.lanes.precision[[0, 2]], whole.lanes.precision[[0, 2]])
+    out = with_found_shares(whole, none, rows, dataclasses.replace(part, force_share=None))
+    assert (out.shares, out.force_share) == (None, None)

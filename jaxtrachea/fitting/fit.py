@@ -9,7 +9,13 @@ import numpy as np
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.evaluate import evaluated
-from jaxtrachea.fitting.force_share import MAX_ITERATIONS, changed, next_levels, with_levels
+from jaxtrachea.fitting.force_share import (
+    MAX_ITERATIONS,
+    changed,
+    next_levels,
+    with_found_shares,
+    with_levels,
+)
 from jaxtrachea.fitting.information import fixed_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
@@ -83,8 +89,7 @@ def with_omitted_zeros(
 ) -> FitResult:
     """The fit with the onsets and force offsets that its residuals ask for.
 
-    Their lanes are fitted again, or all where the noise has a share of the force. A study that was
-    changed since it was built stays as it is.
+    Their lanes are fitted again. A study that was changed since it was built stays as it is.
 
     Args:
         study: as `build_study` made it.
@@ -93,17 +98,15 @@ def with_omitted_zeros(
         progress: as for `fit`.
     """
     alive = None if progress is None else lambda done, of: progress(0, of)
+    rows = np.arange(result.lanes)  # who asked for nothing does not later
     for _ in range(MORE_ZEROS):
-        if study.recipe is None or not (asked := asked_for(result)).names:
+        if study.recipe is None or not (asked := asked_for(result, rows)).names:
             break
         study = with_zeros(study, asked.names)
         near = near_estimates(result, study, asked)
-        if study.force_share is not None:
-            result = _without_more_zeros(study, settings, alive, None, near)
-            continue
         rows = np.flatnonzero([any(_key(c) in asked.names for c in lane) for lane in study.curves])
         new = _without_more_zeros(study.take(rows), settings, alive, None, near[rows])
-        result = merged(study, result, rows, new)
+        result = merged(with_found_shares(study, result.study, rows, new.study), result, rows, new)
     return result
 
 

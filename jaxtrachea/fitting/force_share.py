@@ -69,6 +69,36 @@ def with_shares(study: Study, shares: Shares, precision: Float[np.ndarray, "lane
     return dataclasses.replace(study, lanes=study.lanes._replace(**changed), shares=shares)
 
 
+def with_found_shares(
+    study: Study, before: Study, rows: Int[np.ndarray, " n"], new: Study
+) -> Study:
+    """The study with the shares of its fit: of lanes `rows` those of `new`, else those of `before`.
+
+    Args:
+        study: as it was built.
+        before: of all its lanes, as a fit left it.
+        rows: lanes of `new`.
+        new: of these lanes, as a fit left it.
+    """
+    if before.shares is None and new.shares is None:
+        return dataclasses.replace(study, force_share=None)
+    old, other = as_weighed(before), as_weighed(new)
+
+    def both(name: str):
+        values, of_rows = getattr(old.shares, name), getattr(other.shares, name)
+        return None if values is None else _replaced(values, rows, of_rows)
+
+    precision = _replaced(old.lanes.precision, rows, other.lanes.precision)
+    return with_shares(study, Shares(*map(both, Shares._fields)), precision)
+
+
+def _replaced(values, rows: Int[np.ndarray, " n"], by) -> np.ndarray:
+    """The values with other rows."""
+    out = np.array(values)
+    out[rows] = by
+    return out
+
+
 def next_levels(result: FitResult) -> tuple[Levels, Float[np.ndarray, "lanes T N"]]:
     """Sigma and share by the residuals of a fit, and the forces that it predicts without offset.
 

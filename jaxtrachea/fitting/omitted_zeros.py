@@ -73,7 +73,7 @@ class _Columns(NamedTuple):
     zeros: Float[np.ndarray, "n Z T m"]
 
 
-def asked_for(result: FitResult) -> Asked:
+def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
     """Zeros of the curves of a fit that are fixed, `auto`, and not to be fixed by its residuals.
 
     Costs nothing where no zero is `auto`: bonded contact, or zeros that the user names. Else the
@@ -82,9 +82,10 @@ def asked_for(result: FitResult) -> Asked:
 
     Args:
         result: the fit.
+        among: lanes that are looked at, in order.
     """
     able = _able(result)
-    lanes = np.flatnonzero(able.any(axis=(1, 2)))
+    lanes = among[able[among].any(axis=(1, 2))]
     out = Asked({}, {})
     if not len(lanes) or result.study.size == 0:
         return out

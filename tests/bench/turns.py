@@ -5,9 +5,10 @@
 
 Each sample is a command in a fresh process with the programs that two before it kept (a cache
 folder for each checkout, emptied at the end) and that were optimised after the second, or, of the
-cold ones, with an empty cache. All find compiled Python. Samples are taken in turns, and the first of a pair alternates (A B, B A, ...). Given are
-wall seconds and processor seconds (user and system, of all cores), which a busy machine moves less,
-medians, and the ratio of medians, after over before.
+cold ones, with an empty cache. All find compiled Python. Samples are taken in turns, and the first
+of a pair alternates (A B, B A, ...). Given are wall seconds and processor seconds (user and system,
+of all cores), which a busy machine moves less, medians, and the ratio of medians, after over
+before.
 The specimens are those of situations.py, clean, four positions of 60 samples.
 `--specimens 0`, `--cold 0` leave out. Rows go to results/turns.jsonl under NAME, others stay there.
 """
