@@ -223,7 +223,7 @@ def in_time(v: Values) -> Answer:
 
 def contacts(v: Values) -> Answer:
     """`contacts.solve`: three tools on one skeleton; status of the last."""
-    width = jnp.asarray(1e-6, v["D"].dtype)
+    width = jnp.asarray(1e-12, v["D"].dtype)
     there = v["there"] > 0
     got = solve(v["D"], v["C"], Law(v["k_1"], v["k_3"]), width=width, present=there)
     return {"force": got.force, "depth": got.depth}, got.status[-1]
