@@ -355,7 +355,7 @@ def test_what_does_not_go_together():
         ({"several_points": True}, {}, "contact_point 'fixed'"),
         ({"poses": True, "slip": 40.0, "spacing": 10.0}, {}, "does not keep its place"),
         ({"slip": 1.0, "along": 0.5, "friction": True}, {}, "with friction 'off'"),
-        ({"known": frozenset({"sections"})}, {"contact": "bonded"}, r"give \[material\] in the place of"),
+        ({"known": frozenset({"sections"})}, {"contact": "bonded"}, r"give \[material\] in"),
         ({"known": frozenset({"relaxation"}), "timed": True}, {}, "set relaxation 'off'"),
         ({"known": frozenset({"e_1", "e_2"}), "way_fixed": (0.0, 0.2), "softness": (-1.4, 0.9)}, {},
          "set skeleton 'linear'"),
