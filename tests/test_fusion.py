@@ -32,7 +32,7 @@ from jaxtrachea.contact.shapes import capsule
 from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
-from jaxtrachea.scene.deform import _sag
+from jaxtrachea.scene.deform import sag
 
 NOT_INLINED = 'inlineable="false"'
 #: With the first word: XLA makes calls of its own small loops.
@@ -535,7 +535,7 @@ def test_a_tool_of_few_corners_is_in_the_kernel_that_lays_out_a_dent():
     """Its distance from the dent's centres, in turn; a sphere's is a formula."""
     pose = Poses(jnp.eye(3), jnp.asarray([70.0, 15.0, 0.0]))
     tool = capsule(2.0, 6.0)
-    program = jax.make_jaxpr(lambda points: _sag(tool, pose, points))(jnp.ones((16, 3)))
+    program = jax.make_jaxpr(lambda points: sag(tool, pose, points))(jnp.ones((16, 3)))
     assert fusion.fits_one_kernel(program.jaxpr)
 
 

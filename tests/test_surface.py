@@ -423,7 +423,7 @@ fit = jitted(local.fit, compiler_options=QUICK)
 centres = jitted(local.centres, static_argnames="count", compiler_options=QUICK)
 targets = jitted(local.targets, compiler_options=QUICK)
 correction = jitted(local.correction, compiler_options=QUICK)
-kernel = jitted(local._kernel, compiler_options=QUICK)
+kernel = jitted(local.kernel, compiler_options=QUICK)
 
 
 def dent(count, spacing=1.5, reach=5.0, depth=(0.2, -1.0, 0.3), sag=0.0, dtype="float64"):

@@ -25,7 +25,6 @@ from jaxtrachea.relaxation.steps import (
     differentiable_in_lanes,
     factors,
     fading,
-    lanes_last,
 )
 
 
@@ -299,5 +298,5 @@ def _bonded_loop_with_derivatives(*given):
     return _loop_with_derivatives(*given, unilateral=False)
 
 
-_with_derivatives = lanes_last(_loop_with_derivatives)
-_bonded_with_derivatives = lanes_last(_bonded_loop_with_derivatives)
+_with_derivatives = differentiable_in_lanes(_loop_with_derivatives)
+_bonded_with_derivatives = differentiable_in_lanes(_bonded_loop_with_derivatives)

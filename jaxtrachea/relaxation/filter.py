@@ -30,9 +30,9 @@ from jaxtrachea.relaxation.steps import (
     Branches,
     bonded_filter,
     bonded_in_parallel,
+    differentiable_in_lanes,
     fading,
     in_parallel,
-    lanes_last,
     loop_with_derivatives,
     unilateral_filter,
 )
@@ -152,7 +152,7 @@ def relax_with_derivatives(
     x, lost = fading(time, branches)
     loop = functools.partial(loop_with_derivatives, unilateral=unilateral, surface=surface)
     # Samples and branches in front, as the loop reads them.
-    force, of_surface, d_force, d_surface = lanes_last(loop)(
+    force, of_surface, d_force, d_surface = differentiable_in_lanes(loop)(
         x, lost, elastic, columns.T, branches.gamma, along
     )
     d_surface = None if d_surface is None else d_surface.T

@@ -269,7 +269,7 @@ def loop_with_derivatives(
     return jax.lax.scan(step, start, (x, lost, elastic, columns))[1]
 
 
-def lanes_last(loop):
+def _lanes_last(loop):
     """A loop over samples as one kernel on a CPU, also of many lanes (`vmap`), its last axis.
 
     What one step reads of all lanes lies together then, and is computed several at a time.
@@ -294,7 +294,7 @@ def lanes_last(loop):
 
 def differentiable_in_lanes(loop):
     """The loop in lanes; its derivatives are those of the loop as it stands, in both modes."""
-    in_lanes = jax.custom_jvp(lanes_last(loop))
+    in_lanes = jax.custom_jvp(_lanes_last(loop))
 
     @in_lanes.defjvp
     def _(primals, tangents):

@@ -15,6 +15,7 @@ from jaxtrachea.contact.pose import pose_from_vector
 from jaxtrachea.contact.shapes import box, sphere
 from jaxtrachea.mechanics.axial import stretch
 from jaxtrachea.mechanics.beam import Beam, deflect
+from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, ring_weight
 from jaxtrachea.mechanics.friction import Coulomb, slide
@@ -220,11 +221,19 @@ def in_time(v: Values) -> Answer:
     return {"force": got.force, "depth": got.depth}, got.status[-1]
 
 
+def contacts(v: Values) -> Answer:
+    """`contacts.solve`: three tools on one skeleton; status of the last."""
+    width = jnp.asarray(1e-12, v["D"].dtype)
+    there = v["there"] > 0
+    got = solve(v["D"], v["C"], Law(v["k_1"], v["k_3"]), width=width, present=there)
+    return {"force": got.force, "depth": got.depth}, got.status[-1]
+
+
 FUNCTIONS: dict[str, Callable[[Values], Answer]] = {
     f.__name__: f
     for f in (
         series, quintic, total, first_touch, vector, press_9, press_1, compliance_200, beam,
         beam_shear, beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape,
-        on_ring_weight, friction, in_time,
+        on_ring_weight, friction, in_time, contacts,
     )
 }  # fmt: skip

@@ -9,6 +9,7 @@ agree, so that a kink is noticed (`one_sided` rows take three points on their si
 """
 
 import functools
+import itertools
 import json
 import sys
 
@@ -478,12 +479,56 @@ def in_time(v):
     return {"force": force, "depth": depth}
 
 
+def contacts(v):
+    """Three tools: of all sets that may touch the one in which all press and no other would."""
+    D, C, there = v["D"], v["C"], [t > 0 for t in v["there"]]
+    free = [D[i] if t else mp.mpf(0) for i, t in enumerate(there)]
+    for on in itertools.product([True, False], repeat=3):
+        if any(o and not t for o, t in zip(on, there, strict=True)):
+            continue
+        which = [i for i in range(3) if on[i]]
+        F = _pressing(which, D, C, v) if which else []
+        force = [mp.mpf(0)] * 3
+        for i, f in zip(which, F, strict=True):
+            force[i] = f
+        depth = [
+            free[i] - (mp.fsum(C[i][j] * force[j] for j in which) if there[i] else 0)
+            for i in range(3)
+        ]
+        if all(depth[i] > 0 if on[i] else depth[i] <= 0 for i in range(3) if there[i]):
+            return {"force": force, "depth": depth}
+    raise ValueError("no set of contacts is in balance")
+
+
+def _pressing(which, D, C, v):
+    """Forces of tools that all press, by Newton's method on the depths."""
+    k_1, k_3 = ([v[n][i] for i in which] for n in ("k_1", "k_3"))
+    d = mp.matrix([D[i] / (1 + C[i][i] * k) for i, k in zip(which, k_1, strict=True)])
+
+    def law(d):
+        return [a * x + b * x**3 for a, b, x in zip(k_1, k_3, d, strict=True)]
+
+    for _ in range(400):
+        F, E = law(d), [a + 3 * b * x * x for a, b, x in zip(k_1, k_3, d, strict=True)]
+        c = [[C[i][j] for j in which] for i in which]
+        off = [
+            D[i] - x - mp.fsum(p * f for p, f in zip(row, F, strict=True))
+            for i, x, row in zip(which, d, c, strict=True)
+        ]
+        slope = mp.matrix([[p * e for p, e in zip(row, E, strict=True)] for row in c])
+        step = mp.lu_solve(mp.eye(len(which)) + slope, mp.matrix(off))
+        d += step
+        if mp.norm(step) <= mp.mpf(10) ** -250 * mp.norm(d):
+            return law(d)
+    raise ValueError("Newton's method does not converge")
+
+
 MODELS = {
     f.__name__: f
     for f in (
         series, quintic, total, first_touch, vector, press_9, press_1, compliance_200, beam,
         beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight,
-        friction, in_time,
+        friction, in_time, contacts,
     )
 } | {"beam_shear": beam}  # fmt: skip
 
