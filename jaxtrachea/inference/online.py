@@ -233,7 +233,7 @@ class Online:
         residual = Prediction(stream.residual, None)
         seen = Residuals(study, residual, count, at_bound, np.ones(1, bool))
         worth = effective(seen, errors.half_width)
-        code = np.array([status if minimum.finite else FitStatus.NON_FINITE])
+        code = np.array([status if stream.finite else FitStatus.NON_FINITE])
         status = FitStatus(int(final_status(code, errors, at_bound, count - np.sum(~at_bound))[0]))
         misses, open_ = bool(worth.misses[0]), minimum.structure.undetermined
         message, words = "; ".join(filter(None, self._against.values())), ["failed"] * study.size
