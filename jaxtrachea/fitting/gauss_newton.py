@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxtrachea.fitting.covariance import SINGULAR, Uncertainty, analyse
-from jaxtrachea.fitting.needs_review import natural_sizes
+from jaxtrachea.fitting.needs_review import barely_determined, natural_sizes
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.stream import Stream
 from jaxtrachea.fitting.structure import nothing_open, null_spaces, structure_of, suspicious
@@ -39,6 +39,7 @@ class GaussNewton:
         relative: as `FitResult.relative` has it there; (1, P).
         natural: natural sizes of the unknowns there, see `natural_sizes`; (1, P).
         structure: what the positions leave open.
+        barely_determined: see `needs_review.barely_determined`.
     """
 
     def __init__(self, study: Study, dtype: np.dtype):
@@ -50,14 +51,14 @@ class GaussNewton:
         """
         self._empty(study, dtype)
         self.begin(float(study.lanes.s_c[0, 0]))
-        self.append(study.lanes.displacement[0, 0], study.lanes.force[0, 0])
+        self.append(*np.asarray([study.lanes.displacement[0, 0], study.lanes.force[0, 0]]))
         self.uncertainty()
         self._empty(study, dtype)
 
     def _empty(self, study: Study, dtype: np.dtype) -> None:
         theta = study.of_unknowns(lambda p: p.to_scaled(p.value), 0.0)[0]
         self.stream, self._radius = Stream(study, theta, dtype), LONGEST
-        self.structure = nothing_open(study)
+        self.structure, self.barely_determined = nothing_open(study), True
         self._move_to(theta)
 
     @property
@@ -75,6 +76,7 @@ class GaussNewton:
         observed = lanes._replace(precision=np.where(begun[None, :, None], 1.0, lanes.precision))
         self._pressed = dataclasses.replace(self.stream.study, lanes=observed)
         self.structure = structure_of(self._pressed, suspicious(self._pressed))
+        self.barely_determined = bool(barely_determined(self._pressed)[0])
 
     def append(self, displacement: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"]) -> None:
         """Take samples, mm and N, and one step."""

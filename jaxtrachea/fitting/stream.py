@@ -9,7 +9,7 @@ ten-thousandth. One program evaluates blocks, however many there are.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -233,8 +233,15 @@ class Stream:
     def information(self, sums: Sums) -> Information:
         """The same as a fit has it, of the one lane."""
         count, square = float(sum(self.lengths)), np.array([[2 * sums.cost, 0.0]])
-        return Information(
-            bread=sums.hessian[None], meat=sums.hessian[None], gradient=sums.gradient[None],
-            squares=square, plain=square * self._sigma**2, counts=np.array([[count, 0.0]]),
-            spread=np.zeros((1, 2)), psi2=square / max(count, 1.0), dpsi=np.ones(1),
-        )  # fmt: skip
+        found: dict[str, Any] = {
+            "bread": sums.hessian[None],
+            "meat": sums.hessian[None],
+            "gradient": sums.gradient[None],
+            "squares": square,
+            "plain": square * self._sigma**2,
+            "counts": np.array([[count, 0.0]]),
+            "spread": np.zeros((1, 2)),
+            "psi2": square / max(count, 1.0),
+            "dpsi": np.ones(1),
+        }
+        return Information(**found)

@@ -132,7 +132,8 @@ class Online:
         self._given = geometry, options, parameters, noise
         study, self._size = blank_study(*self._given), Size.of(geometry)
         self._candidates, self._deepest = places_of(study, candidates, depth), deepest(study)
-        self._samples, self._criterion = samples, criterion
+        self._samples = samples
+        self._criterion: Criterion = criterion
         dtype = np.dtype(jax.dtypes.canonicalize_dtype(np.float64))
         self._minimum = GaussNewton(study, dtype)
         self._looked: dict[str, int] = {}
@@ -196,13 +197,12 @@ class Online:
     def curves(self) -> list[Curve]:
         """The samples as curves of the specimen "online", trials "1", "2", ..."""
         lanes = self._minimum.stream.study.lanes
+        s, D, F = (np.array(v[0]) for v in (lanes.s_c, lanes.displacement, lanes.force))
         return [
-            Curve(
-                SPECIMEN, f"{t + 1}", float(lanes.s_c[0, t]), 0.0,
-                lanes.displacement[0, t, :n].copy(), lanes.force[0, t, :n].copy(),
-            )
-            for t, n in enumerate(self._minimum.stream.lengths) if n
-        ]  # fmt: skip
+            Curve(SPECIMEN, f"{t + 1}", float(s[t]), 0.0, D[t, :n], F[t, :n])
+            for t, n in enumerate(self._minimum.stream.lengths)
+            if n
+        ]
 
     def study(self) -> Study:
         """The samples as a study for `fit`, with the model and the noise of this stream."""
@@ -238,12 +238,13 @@ class Online:
         misses, open_ = bool(worth.misses[0]), minimum.structure.undetermined
         message, words = "; ".join(filter(None, self._against.values())), ["failed"] * study.size
         if status.succeeded:
-            doubt = local_doubt(study, errors, minimum.natural, ~open_, at_bound)
+            doubt = local_doubt(errors, minimum.natural, ~open_, at_bound)
+            review = minimum.barely_determined or bool(message)
             columns = (errors.se / relative * worth.growth, open_, at_bound, doubt)
             words = [
                 verdict(
                     float(error), structural=bool(o), held=bool(held), misses=misses,
-                    unseen=bool(cause or message),
+                    unseen=bool(cause or review),
                 )
                 for error, o, held, cause in zip(*(v[0] for v in columns), strict=True)
             ]  # fmt: skip
