@@ -82,7 +82,7 @@ class GaussNewton:
         """Take samples, mm and N, and one step."""
         self.stream.append(displacement, force)
         self._adapt(self.stream.advance(self.theta))
-        self._move_to(self.stream.point)
+        self.theta, self.sums = self.stream.point, self.stream.sums(self.stream.point)
         self._move_to(self.theta + self._step())
 
     def settle(self) -> bool:

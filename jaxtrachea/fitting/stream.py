@@ -11,6 +11,8 @@ ten-thousandth. One program evaluates blocks, however many there are.
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -25,7 +27,6 @@ BLOCK, TOGETHER = 32, 4
 #: Fields of a lane with an axis of samples, and with one of trials alone.
 _OF_SAMPLES = ("displacement", "force", "precision")
 _OF_TRIALS = ("s_c", "balance", "value", "index")
-_OF_UNKNOWNS = ("lower", "upper", "active")
 
 
 class Sums(NamedTuple):
@@ -73,6 +74,7 @@ class Stream:
         study: one lane with room for some trials and samples; what is not yet measured is padding.
             Its arrays are written in place, and it has no `curves`.
         lengths: samples of each curve that has begun.
+        sweeps: that have ended.
     """
 
     def __init__(self, study: Study, theta: Float[np.ndarray, " P"], dtype: np.dtype):
@@ -88,12 +90,16 @@ class Stream:
         blank = {name: np.zeros((1, 1, BLOCK)) for name in _OF_SAMPLES}
         lanes = study.lanes._replace(**blank)
         self.study = dataclasses.replace(study, lanes=lanes, curves=((),), change_points=None)
+        # What all blocks have in common lies on the device.
+        blocks = jax.tree.map(lambda v: np.repeat(v, TOGETHER, 0), lanes)
+        self._blocks = jax.tree.map(jnp.asarray, cast(blocks, dtype))
+        self._ones = jnp.ones((TOGETHER, 2), dtype)
         self.lengths: list[int] = []
         self._make_room(8, 4 * BLOCK)
         # Trial of every block, and which of its blocks; those of the last curve begin at `_first`.
         self._place, self._count, self._first = np.zeros((64, 2), int), 0, 0
         self._now, self._next = _Equations(theta), _Equations(theta)
-        self._sweeping, self._square = False, 0.0
+        self.sweeps, self._sweeping, self._square = 0, False, 0.0
 
     def _make_room(self, trials: int, samples: int) -> None:
         """More padding; nothing is compiled."""
@@ -184,6 +190,7 @@ class Stream:
     def _end_sweep(self) -> bool:
         """Take the new point, or not: where the model is not finite or the cost is higher."""
         now, new, self._sweeping = self._now, self._next, False
+        self.sweeps += 1
         cost = now.cost.sum()
         slack = 4 * self.rounding * np.sqrt(2 * cost)
         lower = not self.finite or new.cost.sum() <= cost + slack
@@ -201,12 +208,11 @@ class Stream:
         """At most `TOGETHER` blocks, each at the point of its equations; finite ones are put in."""
         lanes, full = self.study.lanes, [jobs[i % len(jobs)] for i in range(TOGETHER)]
         t, number = self._place[[b for _, b in full]].T
-        part = {k: getattr(lanes, k)[0, t][:, None] for k in _OF_TRIALS}
-        part |= {k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES}
-        part |= {k: np.repeat(getattr(lanes, k), TOGETHER, 0) for k in _OF_UNKNOWNS}
+        part = {k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES}
+        part["s_c"] = lanes.s_c[0, t][:, None]
         theta = np.stack([equations.point for equations, _ in full])
-        given = theta, lanes._replace(**part), np.ones((TOGETHER, 2))
-        point = self._program(*cast(given, self._dtype))
+        theta, part = cast((theta, part), self._dtype)
+        point = self._program(theta, self._blocks._replace(**part), self._ones)
         found = (point.cost, point.gradient, point.hessian, point.value)
         cost, gradient, hessian, value = (np.asarray(v, np.float64) for v in found)
         seen = part["precision"][:, 0] > 0
