@@ -211,7 +211,17 @@ def _one_is_lifted(out):
     assert [int(v) for v in numbers[9:18]] == [0, 0, 1, 0, 0, 16, 0, 0, 0]
 
 
+def _streamed(out):
+    """Six presses, and estimates within 20 % of the specimen."""
+    found = re.findall(r"\('(\w+)', np.float64\(([0-9.]+)\), '(\w+)'\)", out)
+    truth = {"EI_L": 300.0, "k_M": 1.0, "k_1": 0.5, "k_3": 0.2}
+    assert len(re.findall(r"^\d+ mm:", out, re.M)) == 6
+    assert {name: pytest.approx(float(value), rel=0.2) for name, value, _ in found} == truth
+    assert {word for *_, word in found} == {"identifiable"}
+
+
 FINDS = {
+    ("after_a_fit", 1): _streamed,
     ("haptics", 1): _at_rest,
     ("haptics", 2): _learned,
     ("layer", 0): _press,

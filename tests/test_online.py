@@ -242,13 +242,13 @@ def test_samples_that_are_refused(run):
 @pytest.mark.compiling
 def test_in_single_precision(run):
     """Within what rounding of the forces moves: 1e-7 times the norm of force over sigma, in se."""
+    exact, force = run[2], measured()
     with jax.enable_x64(False):
         with pytest.warns(UserWarning, match="computes in float32"):
             one = online()
-        pressed(one, measured())
+        pressed(one, force)
         settled = one.settle()
     assert settled.status == FitStatus.CONVERGED
-    exact, force = run[2], measured()
     off = (np.log(settled.value) - np.log(exact.value)) / exact.relative_error
     rounding = np.finfo(np.float32).eps * np.linalg.norm(force) / SIGMA
     assert rounding < 1e-3

@@ -161,6 +161,8 @@ def half_widths(
     from scipy.special import stdtrit
 
     half = np.full(len(dof), NORMAL)
+    if noise_known.all():
+        return half
     different, which = np.unique(np.maximum(dof, 1), return_inverse=True)
     of_t = stdtrit(different, 0.975)[which.reshape(-1)]
     return np.where((dof > 0) & ~noise_known, of_t, half)

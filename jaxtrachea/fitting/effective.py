@@ -102,7 +102,7 @@ def effective_samples(seen: Prediction) -> Float[np.ndarray, " lanes"]:
     of_forces = _share(seen.force)
     for residual in kinds:
         count = np.sum(np.isfinite(residual), axis=(1, 2))
-        share = _share(residual)
+        share = of_forces if residual is seen.force else _share(residual)
         # Too few neighbours of one kind, or no residual at all: taken for as alike as the forces.
         share = np.where(np.isnan(share), of_forces, share)
         total += np.where(count > 0, count * share, 0)

@@ -1,8 +1,10 @@
 """The minimum of a stream, followed by Gauss-Newton steps inside the bounds while samples come.
 
-One step a sample, on the quadratics of all blocks. It is taken along the directions that are known
-to better than 100 %: what the samples do not tell yet stays where it is, and there the quadratic
-would lead astray. Unknowns that the positions leave open are held, as in `fit`.
+One step a sample, from the point where the samples are linearised, no longer than a radius that
+shrinks where a step has not lowered the cost (Levenberg-Marquardt, as More 1978,
+doi:10.1007/BFb0067700). What the samples do not tell yet stays where it is: directions that are
+known worse than to 100 %, as long as the samples do not ask for a move clearly. Unknowns that the
+positions leave open are held, as in `fit`.
 """
 
 import dataclasses
@@ -10,9 +12,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxtrachea._numerics import epsilon
 from jaxtrachea.fitting.covariance import SINGULAR, Uncertainty, analyse
-from jaxtrachea.fitting.needs_review import natural_sizes
+from jaxtrachea.fitting.needs_review import barely_determined, natural_sizes
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.stream import Stream
 from jaxtrachea.fitting.structure import nothing_open, null_spaces, structure_of, suspicious
@@ -20,8 +21,12 @@ from jaxtrachea.fitting.study import Study
 
 #: Longest step, in natural sizes of the unknowns (1: 100 %).
 LONGEST = 1.0
+#: Standard errors by which the samples ask for a move clearly.
+CLEAR = 3.0
 #: Steps of `settle` at most, and the one with which it ends, in standard errors.
-STEPS, SETTLED = 50, 1e-8
+STEPS, SETTLED = 200, 1e-8
+#: Damping over the largest curvature that steps are tried with, least first.
+_DAMPING = np.logspace(-14, 6, 81)
 
 
 class GaussNewton:
@@ -33,8 +38,8 @@ class GaussNewton:
         sums: the quadratic of all samples about it.
         relative: as `FitResult.relative` has it there; (1, P).
         natural: natural sizes of the unknowns there, see `natural_sizes`; (1, P).
-        finite: whether the model had an equilibrium at every sample at the last estimate.
         structure: what the positions leave open.
+        barely_determined: see `needs_review.barely_determined`.
     """
 
     def __init__(self, study: Study, dtype: np.dtype):
@@ -46,14 +51,14 @@ class GaussNewton:
         """
         self._empty(study, dtype)
         self.begin(float(study.lanes.s_c[0, 0]))
-        self.append(study.lanes.displacement[0, 0], study.lanes.force[0, 0])
+        self.append(*np.asarray([study.lanes.displacement[0, 0], study.lanes.force[0, 0]]))
         self.uncertainty()
         self._empty(study, dtype)
 
     def _empty(self, study: Study, dtype: np.dtype) -> None:
         theta = study.of_unknowns(lambda p: p.to_scaled(p.value), 0.0)[0]
-        self.stream, self._rounding = Stream(study, theta, dtype), epsilon(dtype)
-        self.structure, self.finite = nothing_open(study), True
+        self.stream, self._radius = Stream(study, theta, dtype), LONGEST
+        self.structure, self.barely_determined = nothing_open(study), True
         self._move_to(theta)
 
     @property
@@ -71,34 +76,29 @@ class GaussNewton:
         observed = lanes._replace(precision=np.where(begun[None, :, None], 1.0, lanes.precision))
         self._pressed = dataclasses.replace(self.stream.study, lanes=observed)
         self.structure = structure_of(self._pressed, suspicious(self._pressed))
+        self.barely_determined = bool(barely_determined(self._pressed)[0])
 
     def append(self, displacement: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"]) -> None:
         """Take samples, mm and N, and one step."""
         self.stream.append(displacement, force)
-        self.finite = self.stream.advance(self.theta)
-        self._move_to(self.stream.point)
-        self._move_to(self.theta + self._step(known=1.0))
+        self._adapt(self.stream.advance(self.theta))
+        self.theta, self.sums = self.stream.point, self.stream.sums(self.stream.point)
+        self._move_to(self.theta + self._step())
 
     def settle(self) -> bool:
         """Linearise all samples at the estimate and step, until it stays: whether it does."""
-        lowest, best = np.inf, self.theta
-        # What rounding leaves, in standard errors.
-        lanes = self.stream.study.lanes
-        rounding = self._rounding * float(np.linalg.norm(lanes.force * lanes.precision))
         for _ in range(STEPS):
-            self.finite = self.stream.sweep(self.theta)
-            self._move_to(self.theta)
-            if not self.finite or self.sums.cost > lowest + rounding * (1 + lowest):
-                self._move_to(0.5 * (best + self.theta))  # further than the quadratic holds
-                continue
-            lowest, best = self.sums.cost, self.theta
-            step = self._step(known=None)
-            if step @ self.sums.hessian @ step <= max(SETTLED, rounding) ** 2:
+            self._move_to(self.stream.point)
+            step = self._step(everything=True)
+            if step @ self.sums.hessian @ step <= max(SETTLED, self.stream.rounding) ** 2:
                 return True
-            self._move_to(self.theta + step)
-        self.stream.sweep(best)
-        self._move_to(best)
+            self._adapt(self.stream.sweep(self.theta + step))
         return False
+
+    def _adapt(self, accepted: bool | None) -> None:
+        """The radius, after a sweep: longer or shorter."""
+        if accepted is not None:
+            self._radius = min(2 * self._radius, LONGEST) if accepted else 0.25 * self._radius
 
     def uncertainty(self) -> Uncertainty:
         """Errors of the estimate, as a fit has them."""
@@ -112,21 +112,27 @@ class GaussNewton:
             noise_given=study.noise_given, noise_known=study.noise_known, structural=open_,
         )  # fmt: skip
 
-    def _step(self, *, known: float | None) -> Float[np.ndarray, " P"]:
-        """To the minimum of the quadratic within the bounds, along directions known so well.
+    def _step(self, *, everything: bool = False) -> Float[np.ndarray, " P"]:
+        """To the minimum of the quadratic within radius and bounds.
 
         Args:
-            known: information from which on a direction is taken, in natural sizes; None: all that
-                are not singular.
+            everything: along directions that are known badly, too.
         """
         lanes, free = self.stream.study.lanes, ~(self.at_bound | self.structure.pinned)[0]
         unit = self.natural[0] * free
         values, vectors = np.linalg.eigh(self.sums.hessian * unit[:, None] * unit)
-        taken = values > (SINGULAR**2 * values[-1] if known is None else known)
-        ways, values = vectors[:, taken], values[taken]
-        step = -ways @ (ways.T @ (unit * self.sums.gradient) / values)
-        step = step * LONGEST / max(LONGEST, float(np.linalg.norm(step)))
-        ahead: np.ndarray = np.clip(self.theta + unit * step, lanes.lower[0], lanes.upper[0])
+        slope = vectors.T @ (unit * self.sums.gradient)
+        taken = values > SINGULAR**2 * values[-1]
+        if not everything:
+            taken &= (values > 1) | (slope**2 > CLEAR**2 * values)
+        values, slope, ways = values[taken], slope[taken], vectors[:, taken]
+        if not taken.any():
+            return np.zeros(len(free))
+        damping = np.append(0, values[-1] * _DAMPING)[:, None]
+        steps = -slope / (values + damping)
+        short = np.linalg.norm(steps, axis=1) <= self._radius
+        step = unit * (ways @ steps[np.argmax(short) if short.any() else -1])
+        ahead: np.ndarray = np.clip(self.theta + step, lanes.lower[0], lanes.upper[0])
         return ahead - self.theta
 
     def _move_to(self, theta: Float[np.ndarray, " P"]) -> None:

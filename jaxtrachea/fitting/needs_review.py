@@ -39,27 +39,27 @@ def needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P
         minima: where all starts ended.
     """
     alive = np.isin(result.status, _SITUATED)
-    present = (result.study.lanes.active > 0) & ~result.undetermined & alive[:, None]
+    present = np.asarray(result.study.lanes.active > 0)
+    present = present & ~result.undetermined & alive[:, None]
     natural = natural_sizes(result.study, result.relative, result.first_touch)
-    doubt = local_doubt(result.study, result.uncertainty, natural, present, result.at_bound)
+    doubt = local_doubt(result.uncertainty, natural, present, result.at_bound)
     se = result.uncertainty.se / natural
     se = np.where(present & np.isfinite(se), se, 0)
     failed = result.status > FitStatus.UNIDENTIFIABLE
     everything = failed | _elsewhere_as_low(result, minima, se, natural)
+    everything |= barely_determined(result.study)
     return present & (doubt | everything[:, None])
 
 
 def local_doubt(
-    study: Study,
     uncertainty: Uncertainty,
     natural: Float[np.ndarray, "lanes P"],
     present: Bool[np.ndarray, "lanes P"],
     at_bound: Bool[np.ndarray, "lanes P"],
 ) -> Bool[np.ndarray, "lanes P"]:
-    """Unknowns that give cause by what is known at the estimate alone, without other starts.
+    """Unknowns that give cause by their errors at the estimate alone.
 
     Args:
-        study: the study.
         uncertainty: at the estimate.
         natural: from `natural_sizes`.
         present: unknowns that are asked about.
@@ -77,7 +77,6 @@ def local_doubt(
     doubt = np.any(long[:, None] & (np.abs(vectors) * root[:, None] > PART), axis=2)
     lost = present & ~known & ~at_bound
     everything = at_bound.any(axis=1) | lost.any(axis=1) | (root.max(axis=1) > VERY_LONG)
-    everything |= barely_determined(study)
     return present & (doubt | everything[:, None])
 
 

@@ -3,17 +3,20 @@
 The samples lie in blocks, each with its normal equations. The sum of all is the quadratic whose
 minimum a Gauss-Newton step finds. All blocks are linearised at one point: at several points each
 would leave another combination undetermined, and their sum none. A sweep over the blocks to the
-newest estimate is always under way, a few of them with every sample, and takes the place of the
-present point when it is through. So a sample costs as much whether it is the tenth or the
+newest estimate is always under way, a few of them with every sample; when it is through and has
+lowered the cost, that is the point. So a sample costs as much whether it is the tenth or the
 ten-thousandth. One program evaluates blocks, however many there are.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxtrachea._numerics import epsilon
 from jaxtrachea.fitting.cost import evaluate
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.study import Study
@@ -24,7 +27,6 @@ BLOCK, TOGETHER = 32, 4
 #: Fields of a lane with an axis of samples, and with one of trials alone.
 _OF_SAMPLES = ("displacement", "force", "precision")
 _OF_TRIALS = ("s_c", "balance", "value", "index")
-_OF_UNKNOWNS = ("lower", "upper", "active")
 
 
 class Sums(NamedTuple):
@@ -72,6 +74,7 @@ class Stream:
         study: one lane with room for some trials and samples; what is not yet measured is padding.
             Its arrays are written in place, and it has no `curves`.
         lengths: samples of each curve that has begun.
+        sweeps: that have ended.
     """
 
     def __init__(self, study: Study, theta: Float[np.ndarray, " P"], dtype: np.dtype):
@@ -87,12 +90,16 @@ class Stream:
         blank = {name: np.zeros((1, 1, BLOCK)) for name in _OF_SAMPLES}
         lanes = study.lanes._replace(**blank)
         self.study = dataclasses.replace(study, lanes=lanes, curves=((),), change_points=None)
+        # What all blocks have in common lies on the device.
+        blocks = jax.tree.map(lambda v: np.repeat(v, TOGETHER, 0), lanes)
+        self._blocks = jax.tree.map(jnp.asarray, cast(blocks, dtype))
+        self._ones = jnp.ones((TOGETHER, 2), dtype)
         self.lengths: list[int] = []
         self._make_room(8, 4 * BLOCK)
         # Trial of every block, and which of its blocks; those of the last curve begin at `_first`.
         self._place, self._count, self._first = np.zeros((64, 2), int), 0, 0
         self._now, self._next = _Equations(theta), _Equations(theta)
-        self._sweeping = False
+        self.sweeps, self._sweeping, self._square = 0, False, 0.0
 
     def _make_room(self, trials: int, samples: int) -> None:
         """More padding; nothing is compiled."""
@@ -122,7 +129,7 @@ class Stream:
         lanes, t, new = self.study.lanes, len(self.lengths) - 1, slice(begin, end)
         lanes.displacement[0, t, new], lanes.force[0, t, new] = displacement, force
         lanes.precision[0, t, new] = 1 / self._sigma
-        self.lengths[-1] = end
+        self.lengths[-1], self._square = end, self._square + np.sum((force / self._sigma) ** 2)
         numbers = np.arange(begin // BLOCK, -(-end // BLOCK))
         self._count = self._first + int(numbers[-1]) + 1
         while self._count > len(self._place):
@@ -139,55 +146,73 @@ class Stream:
         return self._now.point
 
     @property
+    def rounding(self) -> float:
+        """Move of the estimate that rounding of the forces alone makes, in standard errors."""
+        return epsilon(self._dtype) * float(np.sqrt(self._square))
+
+    @property
     def residual(self) -> Float[np.ndarray, "1 T N"]:
         """Model minus data at the point, N; NaN in padding."""
         out = np.full(self.study.lanes.force.shape, np.nan)
         self._by_block(out)[tuple(self._place[: self._count].T)] = self._now.residual[: self._count]
         return out
 
-    def advance(self, theta: Float[np.ndarray, " P"]) -> bool:
-        """Take in new samples, and go on with the sweep to a new point; `theta` if none is on.
+    def advance(self, theta: Float[np.ndarray, " P"]) -> bool | None:
+        """Take in new samples, and go on with the sweep; with a new one to `theta` if none is on.
 
         Returns:
-            Whether the model gave finite numbers for the new samples at the present point; a block
-            where it did not stays as it was.
+            Whether a sweep ended that has lowered the cost, and all blocks are linearised anew, or
+            one that has not, and all stays; None: none has ended.
         """
         if not self._sweeping:
-            self._next.point, self._sweeping = theta, True
-            self._next.fresh[:] = False
+            self._begin_sweep(theta)
         both = self._now, self._next
         new, left = (np.flatnonzero(~e.fresh[: self._count]).tolist() for e in both)
         slots = TOGETHER * (len(new) // TOGETHER + 1) - len(new)
         jobs = [(self._now, b) for b in new] + [(self._next, b) for b in left[:slots]]
         for first in range(0, len(jobs), TOGETHER):
             self._evaluate(jobs[first : first + TOGETHER])
-        if not self._next.fresh[left[:slots]].all():  # no equilibrium so far away
-            self._next.point = 0.5 * (self._now.point + self._next.point)
-            self._next.fresh[:] = False
-        elif self._next.fresh[: self._count].all():
-            self._now, self._next, self._sweeping = self._next, self._now, False
-        return bool(self._now.fresh[: self._count].all())
+        failed = not self._next.fresh[left[:slots]].all()
+        return self._end_sweep() if failed or self._next.fresh[: self._count].all() else None
 
     def sweep(self, theta: Float[np.ndarray, " P"]) -> bool:
-        """Linearise all blocks at `theta`: whether the model gave finite numbers there."""
-        self._next.point, self._next.fresh[:], self._sweeping = theta, False, False
+        """All of a sweep to `theta` at once: whether it has lowered the cost."""
+        self._begin_sweep(theta)
         for first in range(0, self._count, TOGETHER):
             blocks = range(first, min(first + TOGETHER, self._count))
             self._evaluate([(self._next, b) for b in blocks])
-        if finite := bool(self._next.fresh[: self._count].all()):
-            self._now, self._next = self._next, self._now
-        return finite
+        return self._end_sweep()
+
+    def _begin_sweep(self, theta: Float[np.ndarray, " P"]) -> None:
+        self._next.point, self._sweeping = theta, True
+        self._next.fresh[:] = False
+
+    def _end_sweep(self) -> bool:
+        """Take the new point, or not: where the model is not finite or the cost is higher."""
+        now, new, self._sweeping = self._now, self._next, False
+        self.sweeps += 1
+        cost = now.cost.sum()
+        slack = 4 * self.rounding * np.sqrt(2 * cost)
+        lower = not self.finite or new.cost.sum() <= cost + slack
+        accepted = bool(new.fresh[: self._count].all() and lower)
+        if accepted:
+            self._now, self._next = new, now
+        return accepted
+
+    @property
+    def finite(self) -> bool:
+        """Whether the model gives finite numbers for all samples at the point."""
+        return bool(self._now.fresh[: self._count].all())
 
     def _evaluate(self, jobs: list[tuple[_Equations, int]]) -> None:
         """At most `TOGETHER` blocks, each at the point of its equations; finite ones are put in."""
         lanes, full = self.study.lanes, [jobs[i % len(jobs)] for i in range(TOGETHER)]
         t, number = self._place[[b for _, b in full]].T
-        part = {k: getattr(lanes, k)[0, t][:, None] for k in _OF_TRIALS}
-        part |= {k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES}
-        part |= {k: np.repeat(getattr(lanes, k), TOGETHER, 0) for k in _OF_UNKNOWNS}
+        part = {k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES}
+        part["s_c"] = lanes.s_c[0, t][:, None]
         theta = np.stack([equations.point for equations, _ in full])
-        given = theta, lanes._replace(**part), np.ones((TOGETHER, 2))
-        point = self._program(*cast(given, self._dtype))
+        theta, part = cast((theta, part), self._dtype)
+        point = self._program(theta, self._blocks._replace(**part), self._ones)
         found = (point.cost, point.gradient, point.hessian, point.value)
         cost, gradient, hessian, value = (np.asarray(v, np.float64) for v in found)
         seen = part["precision"][:, 0] > 0
@@ -214,8 +239,15 @@ class Stream:
     def information(self, sums: Sums) -> Information:
         """The same as a fit has it, of the one lane."""
         count, square = float(sum(self.lengths)), np.array([[2 * sums.cost, 0.0]])
-        return Information(
-            bread=sums.hessian[None], meat=sums.hessian[None], gradient=sums.gradient[None],
-            squares=square, plain=square * self._sigma**2, counts=np.array([[count, 0.0]]),
-            spread=np.zeros((1, 2)), psi2=square / max(count, 1.0), dpsi=np.ones(1),
-        )  # fmt: skip
+        found: dict[str, Any] = {
+            "bread": sums.hessian[None],
+            "meat": sums.hessian[None],
+            "gradient": sums.gradient[None],
+            "squares": square,
+            "plain": square * self._sigma**2,
+            "counts": np.array([[count, 0.0]]),
+            "spread": np.zeros((1, 2)),
+            "psi2": square / max(count, 1.0),
+            "dpsi": np.ones(1),
+        }
+        return Information(**found)

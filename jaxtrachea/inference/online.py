@@ -132,10 +132,11 @@ class Online:
         self._given = geometry, options, parameters, noise
         study, self._size = blank_study(*self._given), Size.of(geometry)
         self._candidates, self._deepest = places_of(study, candidates, depth), deepest(study)
-        self._samples, self._criterion = samples, criterion
+        self._samples, self._scales = samples, [v[0] for v in scales(study)]
+        self._criterion: Criterion = criterion
         dtype = np.dtype(jax.dtypes.canonicalize_dtype(np.float64))
         self._minimum = GaussNewton(study, dtype)
-        self._looked: dict[str, int] = {}
+        self._sweeps, self._looked = -1, {}
         self._against: dict[str, str] = {}
         self._gains, self._gains_at = np.zeros(0), np.full(study.size, np.nan)
         self.state = self._known()
@@ -196,13 +197,12 @@ class Online:
     def curves(self) -> list[Curve]:
         """The samples as curves of the specimen "online", trials "1", "2", ..."""
         lanes = self._minimum.stream.study.lanes
+        s, D, F = (np.array(v[0]) for v in (lanes.s_c, lanes.displacement, lanes.force))
         return [
-            Curve(
-                SPECIMEN, f"{t + 1}", float(lanes.s_c[0, t]), 0.0,
-                lanes.displacement[0, t, :n].copy(), lanes.force[0, t, :n].copy(),
-            )
-            for t, n in enumerate(self._minimum.stream.lengths) if n
-        ]  # fmt: skip
+            Curve(SPECIMEN, f"{t + 1}", float(s[t]), 0.0, D[t, :n], F[t, :n])
+            for t, n in enumerate(self._minimum.stream.lengths)
+            if n
+        ]
 
     def study(self) -> Study:
         """The samples as a study for `fit`, with the model and the noise of this stream."""
@@ -230,27 +230,30 @@ class Online:
         minimum, stream = self._minimum, self._minimum.stream
         study, relative, at_bound = stream.study, minimum.relative, minimum.at_bound
         errors, count = minimum.uncertainty(), np.array([sum(stream.lengths)])
-        residual = Prediction(stream.residual, None)
-        seen = Residuals(study, residual, count, at_bound, np.ones(1, bool))
-        worth = effective(seen, errors.half_width)
-        code = np.array([status if minimum.finite else FitStatus.NON_FINITE])
+        if stream.sweeps != self._sweeps:  # residuals are those of the point
+            residual = Prediction(stream.residual, None)
+            seen = Residuals(study, residual, count, at_bound, np.ones(1, bool))
+            self._worth, self._sweeps = effective(seen, errors.half_width), stream.sweeps
+        worth = self._worth
+        code = np.array([status if stream.finite else FitStatus.NON_FINITE])
         status = FitStatus(int(final_status(code, errors, at_bound, count - np.sum(~at_bound))[0]))
         misses, open_ = bool(worth.misses[0]), minimum.structure.undetermined
         message, words = "; ".join(filter(None, self._against.values())), ["failed"] * study.size
         if status.succeeded:
-            doubt = local_doubt(study, errors, minimum.natural, ~open_, at_bound)
+            doubt = local_doubt(errors, minimum.natural, ~open_, at_bound)
+            review = minimum.barely_determined or bool(message)
             columns = (errors.se / relative * worth.growth, open_, at_bound, doubt)
             words = [
                 verdict(
                     float(error), structural=bool(o), held=bool(held), misses=misses,
-                    unseen=bool(cause or message),
+                    unseen=bool(cause or review),
                 )
                 for error, o, held, cause in zip(*(v[0] for v in columns), strict=True)
             ]  # fmt: skip
         told = status.succeeded and not misses
         se = np.where(told & ~open_ & np.isfinite(errors.se), errors.se, np.nan)[0]
         se = se * (worth.factor[0] if told else np.nan)
-        log, step = (v[0] for v in scales(study))
+        log, step = self._scales
         value = np.where(log, np.exp(minimum.theta), minimum.theta * step)
         return OnlineState(
             names=tuple(p.name for p, _, _ in study.unknowns[0]), value=value,
