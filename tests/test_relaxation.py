@@ -226,6 +226,14 @@ def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilater
         np.testing.assert_allclose(value[i], plain[i], rtol=0, atol=1e-13)
         rows = np.moveaxis(np.concatenate(expected[i], axis=-1), -1, 1)
         np.testing.assert_allclose(by[i], rows, rtol=0, atol=1e-11)
+
+    def of_lanes(scale):
+        return jax.vmap(beside, axes)(t, elastic, scale, *given[1:])[0]
+
+    # Differentiated once more, as influence does: value, and direction of the first column.
+    along = jax.jit(lambda scale: jax.jvp(of_lanes, (scale,), (jnp.asarray([1.0, 0.0]),))[1])
+    for i, moved in enumerate(along(given[0])[:2]):
+        np.testing.assert_allclose(moved, by[i][:, 0], rtol=0, atol=1e-11)
     alone = jax.eval_shape(relax_with_derivatives, t[0], elastic[0], elastic[:1], two())
     assert alone[1].elastic is None
 
