@@ -81,7 +81,9 @@ def with_found_shares(
         new: of these lanes, as a fit left it.
     """
     if before.shares is None and new.shares is None:
-        return dataclasses.replace(study, force_share=None)
+        # Not a copy where nothing was looked for: that would have no recipe.
+        wanted = study.force_share is not None
+        return dataclasses.replace(study, force_share=None) if wanted else study
     old, other = as_weighed(before), as_weighed(new)
 
     def both(name: str):
