@@ -39,6 +39,7 @@ from jaxtrachea.scene.step import (
     init_state,
     origin_of,
 )
+from jaxtrachea.scene.step_together import States
 
 #: For what a compiled session cannot take.
 CURE = "make a new Session"
@@ -249,7 +250,7 @@ class Session:
         return result
 
     @property
-    def state(self) -> State:
+    def state(self) -> State | States:
         """What the next step begins with: to save, restore or branch, or to `step` on from.
 
         A state that is given back goes on to the bit as it did. The force that was held is not in
@@ -262,12 +263,19 @@ class Session:
         return dataclasses.replace(state, origin=origin_of(scene))
 
     @state.setter
-    def state(self, state: State) -> None:
+    def state(self, state: State | States) -> None:
         check_state(self.scene, state)
         own = dataclasses.replace(state, origin=self._states.like.origin)
         with self._lock:
             self._program.state = jnp.array(self._states.fill(own))
             self._last_force = self._no_force()
+            if isinstance(state, States):
+                last = [tool.last.path for tool in state.tools]
+                turns, places = (
+                    np.stack([np.asarray(v[0], self.dtype) for v in of_all])
+                    for of_all in zip(*((p.rotation, p.translation) for p in last), strict=True)
+                )
+                self._stands = turns, places, np.array(state.present)
 
     def __deepcopy__(self, memo: dict) -> "Session":
         """One that goes on from the same state by the same program."""

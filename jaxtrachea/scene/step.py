@@ -100,7 +100,8 @@ def init_state(scene: Scene, material: AnyMaterial) -> State | States:
     check_scene(scene, material)
     if scene.instruments:
         views = [scene_of(scene, instrument) for instrument in scene.instruments]
-        return States(tuple(_start(view, None) for view in views), origin_of(scene))
+        states = tuple(_start(view, None) for view in views)
+        return States(states, jnp.zeros(len(views), bool), origin_of(scene))
     state = _start(scene, _rest(scene, material))
     return dataclasses.replace(state, origin=origin_of(scene))
 

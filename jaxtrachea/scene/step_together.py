@@ -26,10 +26,12 @@ class States(eqx.Module):
 
     Attributes:
         tools: a `step.State` of each, in the order of `Scene.instruments`.
+        present: which of them were there; shape (m,).
         origin: the scene that they belong to (static).
     """
 
     tools: tuple[Any, ...]
+    present: Bool[Array, " m"]
     origin: Any = eqx.field(static=True)
 
 
@@ -71,7 +73,7 @@ def move_tools(
     wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
     result = result._replace(status=jnp.where(jnp.all(known), result.status, wrong))
     after = (pick(h.known, h.state, old) for h, old in zip(held, states.tools, strict=True))
-    return States(tuple(after), states.origin), result, (moved,)
+    return States(tuple(after), present, states.origin), result, (moved,)
 
 
 def _hold(view: Scene, material: AnyMaterial, state: Any, path: Poses, seen, present) -> _Held:
