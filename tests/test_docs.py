@@ -213,11 +213,12 @@ def _one_is_lifted(out):
 
 def _streamed(out):
     """Six presses, and estimates within 20 % of the specimen."""
-    found = re.findall(r"\('(\w+)', np.float64\(([0-9.]+)\), '(\w+)'\)", out)
+    found = re.findall(r"^(\w+) ([0-9.]+) (\w+)$", out, re.M)
     truth = {"EI_L": 300.0, "k_M": 1.0, "k_1": 0.5, "k_3": 0.2}
     assert len(re.findall(r"^\d+ mm:", out, re.M)) == 6
     assert {name: pytest.approx(float(value), rel=0.2) for name, value, _ in found} == truth
-    assert {word for *_, word in found} == {"identifiable"}
+    # Three positions and their mirror images: other skeletons may fit as well.
+    assert {word for *_, word in found} <= {"inconclusive", "identifiable"}
 
 
 FINDS = {

@@ -208,7 +208,9 @@ class Stream:
         """At most `TOGETHER` blocks, each at the point of its equations; finite ones are put in."""
         lanes, full = self.study.lanes, [jobs[i % len(jobs)] for i in range(TOGETHER)]
         t, number = self._place[[b for _, b in full]].T
-        part = {k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES}
+        part: dict[str, Any] = {
+            k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES
+        }
         part["s_c"] = lanes.s_c[0, t][:, None]
         theta = np.stack([equations.point for equations, _ in full])
         theta, part = cast((theta, part), self._dtype)

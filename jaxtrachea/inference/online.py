@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
-from jaxtrachea.fitting.effective import effective
+from jaxtrachea.fitting.covariance import Uncertainty
+from jaxtrachea.fitting.effective import Effective, effective
 from jaxtrachea.fitting.fit import final_status
 from jaxtrachea.fitting.gauss_newton import GaussNewton
 from jaxtrachea.fitting.lanes import Noise
@@ -136,7 +137,7 @@ class Online:
         self._criterion: Criterion = criterion
         dtype = np.dtype(jax.dtypes.canonicalize_dtype(np.float64))
         self._minimum = GaussNewton(study, dtype)
-        self._sweeps, self._looked = -1, {}
+        self._counted, self._looked = (-1, 0), {}
         self._against: dict[str, str] = {}
         self._gains, self._gains_at = np.zeros(0), np.full(study.size, np.nan)
         self.state = self._known()
@@ -230,11 +231,7 @@ class Online:
         minimum, stream = self._minimum, self._minimum.stream
         study, relative, at_bound = stream.study, minimum.relative, minimum.at_bound
         errors, count = minimum.uncertainty(), np.array([sum(stream.lengths)])
-        if stream.sweeps != self._sweeps:  # residuals are those of the point
-            residual = Prediction(stream.residual, None)
-            seen = Residuals(study, residual, count, at_bound, np.ones(1, bool))
-            self._worth, self._sweeps = effective(seen, errors.half_width), stream.sweeps
-        worth = self._worth
+        worth = self._worth_of_samples(errors, count)
         code = np.array([status if stream.finite else FitStatus.NON_FINITE])
         status = FitStatus(int(final_status(code, errors, at_bound, count - np.sum(~at_bound))[0]))
         misses, open_ = bool(worth.misses[0]), minimum.structure.undetermined
@@ -262,6 +259,17 @@ class Online:
             next_point=self._next(float(worth.factor[0]) if told else 1.0),
             samples=int(count[0]), status=status, message=message,
         )  # fmt: skip
+
+    def _worth_of_samples(self, errors: Uncertainty, count: Int[np.ndarray, "1"]) -> Effective:
+        """As a fit has it of the residuals; kept until these or the samples have changed."""
+        minimum, stream, (sweeps, before) = self._minimum, self._minimum.stream, self._counted
+        # Residuals are those of the point; a tenth more samples may be correlated otherwise.
+        if stream.sweeps != sweeps or count[0] > 1.1 * before:
+            residual, solved = Prediction(stream.residual, None), np.ones(1, bool)
+            seen = Residuals(stream.study, residual, count, minimum.at_bound, solved)
+            self._worth = effective(seen, errors.half_width)
+            self._counted = stream.sweeps, int(count[0])
+        return self._worth
 
     def _next(self, factor: float) -> float:
         """The most telling place, given what is known; as `situation` of a fit."""
