@@ -6,10 +6,11 @@ import re
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from run_cli import GOOD, run
 
 from jaxtrachea.files.html import ROWS, page
-from jaxtrachea.files.pictures import with_ending
+from jaxtrachea.files.pictures import save_each, with_ending
 
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 VOID = {"meta", "img"}
@@ -95,6 +96,13 @@ def test_a_verdict_has_its_colour_and_files_beside_are_links():
     assert '<a href="a b.csv"><code>a b.csv</code></a>, <code>none.csv</code>' in made
     assert Reader(made).links[:3] == ["a b.csv", "#of-a-b", "#of-a-b-"]
     assert made.index("<nav>") < made.index('<h2 id="of-a-b">') < made.index('<h2 id="of-a-b-">')
+
+
+def test_the_ending_of_a_picture_says_what_it_holds(tmp_path):
+    drawings = {"a.png": Figure, "b.svg": Figure}
+    save_each(tmp_path, drawings)
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (tmp_path / "b.svg").read_text()
 
 
 def test_pictures_may_be_svg():

@@ -49,7 +49,7 @@ def save_each(
 
     Args:
         folder: where to.
-        drawings: name of a PNG file to what returns the figure.
+        drawings: file name, with its ending (`png` or `svg`), to what returns the figure.
 
     Returns:
         The files written, and for those that are not, why.
@@ -58,6 +58,7 @@ def save_each(
         OSError: a file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     paths, lost = [], {}
     for name, draw in drawings.items():
@@ -66,7 +67,10 @@ def save_each(
             with warnings.catch_warnings():
                 # A letter that the font has not got is drawn as a box.
                 warnings.filterwarnings("ignore", message=r"(?s).*Glyph .* missing")
-                FigureCanvasAgg(draw()).print_png(memory)
+                if name.endswith(".svg"):
+                    FigureCanvasSVG(draw()).print_svg(memory)
+                else:
+                    FigureCanvasAgg(draw()).print_png(memory)
         except Exception as error:  # a picture is worth less than the numbers
             lost[name] = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             continue

@@ -6,7 +6,7 @@ of a fit by maximum likelihood, in turns with the fit. F is the force that the f
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -86,7 +86,7 @@ def with_found_shares(
         return dataclasses.replace(study, force_share=None) if wanted else study
     old, other = as_weighed(before), as_weighed(new)
 
-    def both(name: str):
+    def both(name: str) -> Any:
         values, of_rows = getattr(old.shares, name), getattr(other.shares, name)
         return None if values is None else _replaced(values, rows, of_rows)
 
