@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, relative
 from jaxtrachea.contact.search import FAST
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.stage import Poses
 
 
@@ -18,21 +18,23 @@ def overlapping(tools: Sequence[Shape], paths: Sequence[Poses]) -> Bool[Array, "
     """Rows and tools where an upper bound of the signed distance to another tool is negative.
 
     Args:
-        tools: their shapes.
+        tools: their shapes, each convex or of convex parts.
         paths: where each stands; all of as many rows.
     """
-    most = max(tool.vertices.shape[1] for tool in tools)
+    bodies = [(i, part) for i, tool in enumerate(tools) for part in parts_of(tool)]
+    owner = np.array([i for i, _ in bodies])
+    most = max(body.vertices.shape[1] for _, body in bodies)
 
-    def padded(tool: Shape) -> Shape:
+    def padded(body: Shape) -> Shape:
         """As many corners as any, the last one repeated: the same hull."""
-        more = most - tool.vertices.shape[1]
-        return Shape(jnp.pad(tool.vertices, ((0, 0), (0, more)), mode="edge"), tool.radius)
+        more = most - body.vertices.shape[1]
+        return Shape(jnp.pad(body.vertices, ((0, 0), (0, more)), mode="edge"), body.radius)
 
-    first, second = np.triu_indices(len(tools), 1)
-    shapes = jax.tree.map(lambda *v: jnp.stack(v), *map(padded, tools))
+    first, second = np.nonzero(owner[:, None] < owner)
+    shapes = jax.tree.map(lambda *v: jnp.stack(v), *(padded(body) for _, body in bodies))
     R, T = (jnp.stack(v) for v in zip(*((p.rotation, p.translation) for p in paths), strict=True))
 
-    def pair(i, j):
+    def pair(i, j, of_i, of_j):
         a = jax.tree.map(lambda v: v[i], shapes)
         b = jax.tree.map(lambda v: v[j], shapes)
 
@@ -40,9 +42,10 @@ def overlapping(tools: Sequence[Shape], paths: Sequence[Poses]) -> Bool[Array, "
             between = relative(Pose(*poses[:2]), Pose(*poses[2:]))
             return signed_distance(a, b, between, FAST).upper
 
-        return jax.vmap(distance)(R[i], T[i], R[j], T[j]) < 0
+        return jax.vmap(distance)(R[of_i], T[of_i], R[of_j], T[of_j]) < 0
 
-    found = jax.lax.stop_gradient(jax.vmap(pair)(first, second))
+    owners = owner[first], owner[second]
+    found = jax.lax.stop_gradient(jax.vmap(pair)(first, second, *owners))
     m = np.arange(len(tools))
-    takes_part = (first[:, None] == m) | (second[:, None] == m)
+    takes_part = (owners[0][:, None] == m) | (owners[1][:, None] == m)
     return jnp.any(found[:, :, None] & takes_part[:, None], axis=0)

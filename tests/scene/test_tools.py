@@ -24,7 +24,8 @@ from jaxtrachea import (
     read_simulation,
     simulate,
 )
-from jaxtrachea.contact.shapes import box, sphere
+from jaxtrachea.contact.pose import Pose
+from jaxtrachea.contact.shapes import box, compound, sphere
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.dents import fit, lay_out
@@ -320,6 +321,13 @@ def test_tools_that_overlap_in_space():
     shapes = [sphere(5.0), sphere(2.0), box([1.0, 1.0, 1.0], 0.1)]
     found = jax.jit(overlapping)([jax.tree.map(jnp.asarray, v) for v in shapes], paths)
     assert found.tolist() == [[True, True, False], [False] * 3, [True, True, False]]
+    # A fork of two balls, 20 mm apart: its other tine is 13 mm from the ball that passes.
+    fork = compound(
+        [sphere(5.0), sphere(5.0)], [Pose(jnp.eye(3), jnp.array([0.0, 0, z])) for z in (0, 20)]
+    )
+    paths[1] = Poses(turns, other + [0, 0, 20.0])
+    found = jax.jit(overlapping)([fork, sphere(2.0)], paths[:2])
+    assert found.tolist() == [[True, True], [False] * 2, [True, True]]
 
 
 def test_what_does_not_go_together():
