@@ -108,8 +108,9 @@ def test_a_tie_is_smooth_and_told():
     """Two balls turned through the pose where both are as deep: derivative, and the status."""
     balls = compound([sphere(2.0), sphere(2.0)], [at(-5, 0, 0), at(5, 0, 0)])
 
-    def seen(angle):
-        pose = pose_from_vector(jnp.stack([0 * angle, 0 * angle, angle]), jnp.array([80, 13.9, 0]))
+    def seen(angle, height=14.05):
+        place = jnp.stack([jnp.asarray(v, float) for v in (80, height, 0)])
+        pose = pose_from_vector(jnp.stack([0 * angle, 0 * angle, angle]), place)
         return touch(balls, pose, TUBE, near=4, beta=jnp.asarray(BETA))
 
     angles = np.linspace(-0.02, 0.02, 41)
@@ -117,12 +118,16 @@ def test_a_tie_is_smooth_and_told():
     ((gap, slope), found), step = run(jnp.asarray(angles)), 1e-6
     up, down = (run(jnp.asarray(angles + d))[0][0] for d in (step, -step))
     np.testing.assert_allclose(slope, (up - down) / (2 * step), atol=1e-6)
-    alone = solve(BALL, 3, np.zeros((LANES, 3)), np.tile([75.0, 13.9, 0], (LANES, 1)))
+    alone = solve(BALL, 3, np.zeros((LANES, 3)), np.tile([75.0, 14.05, 0], (LANES, 1)))
     np.testing.assert_allclose(gap[20], alone.gap[0] - np.log(2) / BETA, atol=1e-9)
     np.testing.assert_allclose(found.s[::20], [85, 80, 75], atol=0.1)
     flat = np.asarray(found.status) == ContactStatus.FLAT
     assert flat[20]
     assert not flat[[0, 40]].any()
+    # Both well in the wall, one deeper: there are two contacts.
+    both = quick(seen)(jnp.asarray(0.05), 13.0)
+    assert (int(both.status), int(both.part)) == (ContactStatus.FLAT, 0)
+    np.testing.assert_allclose(both.s, 75, atol=0.1)
 
 
 def test_equal_points_count_once():

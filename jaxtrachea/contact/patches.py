@@ -46,6 +46,8 @@ NEARING = 6
 COUNTS = 1e-3
 #: Share of the size by which the place may lie beside that of the deepest part of a tool.
 APART = 0.05
+#: Share of the size from which on another part that touches makes a contact of its own.
+SECOND = 0.25
 
 
 class Patches(eqx.Module):
@@ -181,7 +183,8 @@ def touch(
         The `Touch`; differentiable in tool, pose and patches. Its gap changes with a shift of the
         tool by the average of the patches' normals, which is `normal` but for its length. Where two
         parts of the tool are equally deep, place and normal lie between both; if that is more than
-        `APART` of the size beside the deepest, the status is FLAT.
+        `APART` of the size beside the deepest, the status is FLAT, and so it is where another part
+        touches further than `SECOND` of the size from there.
 
     Raises:
         ValueError: `near` is not between 1 and the number of patches (times that of parts).
@@ -230,8 +233,11 @@ def _touch(
     deepest, counts = jnp.argmin(each.distance), weight > COUNTS
     worst = jnp.max(jnp.where(counts, each.status, 0))
     if pairs.part is not None:
-        away = point - each.point_a[deepest]
-        tied = total(away * away) > (APART * size) ** 2
+        place = each.point_a[deepest]
+        tied = jnp.sum((point - place) ** 2) > (APART * size) ** 2
+        others = (each.distance < 0) & (pairs.part != pairs.part[deepest])
+        second = jnp.sum((each.point_a - place[None]) ** 2, axis=1) > (SECOND * size) ** 2
+        tied = tied | jnp.any(others & second)
         worst = jnp.where(tied, jnp.maximum(worst, ContactStatus.FLAT), worst)
     if patches.uncertain is not None:
         doubt = jnp.any(counts & patches.uncertain[pairs.patch])

@@ -48,18 +48,7 @@ def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Sha
         for name, part in parts_of(path).items()
     }
     whole = _welded(combined(list(objects.values())))
-    pieces = _pieces(whole)
-    if len(pieces) == 1 or not all(map(_closed, pieces)):
-        pieces = [whole] if _unlike_hull(whole) is None else []
-    found = {"it": whole}
-    if len(pieces) != 1:
-        found = {
-            name if len(pieces) == 1 else f"{name}, body {i}": body
-            for name, part in objects.items()
-            for pieces in [_pieces(part)]
-            for i, body in enumerate(pieces)
-        }
-        _check_bodies(found if len(found) > 1 else {"it": whole})
+    found = _bodies(objects, whole)
     kept, left_out = [], 0.0
     for name, body in found.items():
         corners, out = _corners(body, name)
@@ -72,6 +61,26 @@ def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Sha
     if left_out > 0:
         note += f"; those left out stand out of it by up to {left_out:.2g} mm"
     return kept[0] if len(kept) == 1 else shapes.compound(kept), note
+
+
+def _bodies(objects: dict[str, Surface], whole: Surface) -> dict[str, Surface]:
+    """All in one where that is convex and no closed bodies lie apart; else what hangs together.
+
+    Raises:
+        MeshError: bodies that are no convex parts of a tool.
+    """
+    pieces = _pieces(whole)
+    apart = len(pieces) > 1 and all(map(_closed, pieces))
+    if not apart and _unlike_hull(whole) is None:
+        return {"it": whole}
+    found = {}
+    for name, part in objects.items():
+        pieces = _pieces(part)
+        names = [name] if len(pieces) == 1 else [f"{name}, body {i}" for i in range(len(pieces))]
+        found |= dict(zip(names, pieces, strict=True))
+    found = found if len(found) > 1 else {"it": whole}
+    _check_bodies(found)
+    return found
 
 
 def _welded(surface: Surface) -> Surface:

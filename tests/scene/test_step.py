@@ -243,6 +243,19 @@ def test_a_state_of_another_scene_is_refused(rubbed):
         changed.state = kept
 
 
+def test_the_numbers_of_a_scene_are_read_once(rubbed, monkeypatch):
+    known, digest, calls = stepping.digest_of(rubbed[0]), stepping._digest, []
+    monkeypatch.setattr(stepping, "_digest", lambda v: calls.append(0) or digest(v))
+    scene = dataclasses.replace(rubbed[0])
+    assert [stepping.digest_of(scene) for _ in range(3)] == [known] * 3
+    assert len(calls) == 1
+    number = id(scene)
+    del scene
+    assert number not in stepping._DIGESTS
+    small = dataclasses.replace(rubbed[0], radius=rubbed[0].radius * 0.99)
+    assert stepping.digest_of(small) != known
+
+
 def test_a_bad_pose_is_refused(rubbed):
     scene, material, _ = rubbed
     state, down = jt.init_state(scene, material), jnp.asarray([75, OUTER + 4, 0])
