@@ -490,7 +490,8 @@ def test_rows_of_a_simulation_on_the_terminal(capsys, monkeypatch):
                 s=np.full(count, 80.0), phi=np.full(count, -1e-17), gap=np.full(count, -0.265),
                 force=ones * [0.0741, -0.191, 0], skeleton=ones * [1.14, -2.37, 0],
                 depth_share=np.full(count, 0.24), status=np.zeros(count, int),
-            )
+            ),
+            (),
         )  # fmt: skip
         lines = [line.split() for line in capsys.readouterr().out.split("\n")]
         assert " ".join(lines[0]) == title

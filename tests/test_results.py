@@ -197,7 +197,7 @@ def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
     ):
         (tmp_path / name).mkdir()
         paths, lost = draw_all(tmp_path / name, predicted(result, one))
-        assert (len(paths), lost) == (3, {})
+        assert (len(paths), lost) == (2, {})
         assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
 
 

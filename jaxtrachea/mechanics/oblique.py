@@ -178,7 +178,7 @@ def _press_oblique(
 
 
 def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
-    """As `press_oblique`, on a place that is known."""
+    """As `press_oblique`, on a place that is known; however far the wall moves."""
     force, depth, status = elastic_at(place, displacement, options)
     refused = place.asked.refused
     unit, force, depth = mask(refused, place.unit, force, depth)
@@ -274,12 +274,18 @@ def _press_path(
 ) -> ObliquePath:
     """`press_path`, of arguments that are checked."""
     place = place_at(geometry, material, s_c, phi_c, options, onset=onset)
-    D, C, friction, refused = _rubbed(place, displacement, friction, options)
-    height = jnp.where(place.onset >= 0, place.onset, 0)
-    slid = _friction.slide_path(D, C, place.law, friction, height=height)
-    path = _path_of(place, slid, refused)
+    path = path_at(place, displacement, friction, options)
     status = _mark_deep(place, displacement, path.press.status, geometry)
     return path._replace(press=path.press._replace(status=status))
+
+
+def path_at(
+    place: Place, displacement: Float[Array, "steps 3"], friction: Coulomb, options: ObliqueOptions
+) -> ObliquePath:
+    """As `press_path`, on a place that is known; however far the wall moves."""
+    D, C, friction, refused = _rubbed(place, displacement, friction, options)
+    height = jnp.where(place.onset >= 0, place.onset, 0)
+    return _path_of(place, _friction.slide_path(D, C, place.law, friction, height=height), refused)
 
 
 def slide_at(

@@ -11,9 +11,9 @@ from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import (
     ObliquePress,
     Place,
+    path_at,
     place_at,
-    press_oblique,
-    press_path,
+    press_at,
 )
 from jaxtrachea.mechanics.press import (
     Contact,
@@ -131,20 +131,17 @@ def vectors(
     if plan.friction:
         if scene.friction is None:
             raise ValueError("scene.friction is None; the plan has friction")
-        path = press_path(
-            *fixed, presses.s[0], presses.phi[0], presses.displacement, Coulomb(scene.friction),
-            plan.oblique,
-        )  # fmt: skip
+        place = place_at(*fixed, presses.s[0], presses.phi[0], plan.oblique)
+        path = path_at(place, presses.displacement, Coulomb(scene.friction), plan.oblique)
         return moved_by(path.press, plan)._replace(slip=path.slip, dissipated=path.dissipated)
     if plan.contact_point == "fixed":
-        at = presses.s[0], presses.phi[0], presses.displacement
+        place = place_at(*fixed, presses.s[0], presses.phi[0], plan.oblique)
         if samples is not None:
-            place = place_at(*fixed, *at[:2], plan.oblique)
             return moved_in_time(place, presses, plan, samples)
-        return moved_by(press_oblique(*fixed, *at, plan.oblique), plan)
+        return moved_by(press_at(place, presses.displacement, plan.oblique.press), plan)
 
     def one(s, phi, D):
-        return press_oblique(*fixed, s, phi, D, plan.oblique)
+        return press_at(place_at(*fixed, s, phi, plan.oblique), D, plan.oblique.press)
 
     return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement), plan)
 

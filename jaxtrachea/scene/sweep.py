@@ -12,7 +12,7 @@ from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import long_run
-from jaxtrachea.mechanics.oblique import press_oblique
+from jaxtrachea.mechanics.oblique import place_at, press_at
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections.material import SectionMaterial
@@ -146,7 +146,7 @@ def _vectors(scene: Scene, material: Material, s_c, phi_c, depth) -> _Pressed:
     """On a linear skeleton, anywhere on the rings."""
     straight = dataclasses.replace(scene.plan.oblique, axial=False)  # along the normal
     D = depth * local_frame(phi_c)[0]
-    press = press_oblique(scene.geometry, material, s_c, phi_c, D, straight)
+    press = press_at(place_at(scene.geometry, material, s_c, phi_c, straight), D, straight.press)
     return _Pressed(press.force, press.depth, press.skeleton, press.status)
 
 

@@ -27,7 +27,7 @@ def quietly(patch, folder):
     """Work in `folder`, without plots."""
     patch.chdir(folder)
     patch.setattr("jaxtrachea.report.plots.draw_all", lambda *_: ([], {}))
-    patch.setattr("jaxtrachea.files.html.page", lambda *_: "")
+    patch.setattr("jaxtrachea.files.html.page", lambda *_, **more: "")
 
 
 @pytest.fixture
