@@ -364,9 +364,9 @@ def test_alike_residuals_far_below_the_noise_given_hardly_count():
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_fewer_independent_samples_than_unknowns_leave_no_limit():
-    """A straight line through a bent curve: residuals of one sign, one after the other."""
+    """A law through a curve of another shape: residuals of one sign, one after the other."""
     depth = np.linspace(0, 1, 40)
-    bent = Curve("T", "a", None, 0.0, depth, depth + 0.2 * np.sin(3 * depth))
+    bent = Curve("T", "a", None, 0.0, depth, depth - 0.2 * np.sin(3 * depth))
     result = fit(build_study([bent], table_1(), BONDED, table()), ONE)
     wide = result.effective
     assert wide.samples[0] < 2
@@ -382,7 +382,7 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     assert [row["low95_independent"] for row in rows] == result.lower[0].tolist()
     text = report_text("T", widened(result), [])
     said = " ".join(shown(overview(widened(result))).split())
-    # The line through the curve is above it at first, and again at the end.
+    # The law is above the curve at first, and again at the end.
     place = "Most missed: T a from"
     for where in (text, said):
         assert "The model misses the curves in 1 of 1 fits" in where
