@@ -110,12 +110,16 @@ def _moving(
     rows, s, phi = len(own("s")), own("s"), own("phi")
     turn = np.asarray(rest["phi"] - phi[:, None] + np.pi) % (2 * np.pi) - np.pi
     away = np.hypot(rest["s"] - s[:, None], rest["distance"] * turn)
-    still = path is None
+    if path is None:
+        rotation, translation = np.tile(np.eye(3), (rows, 1, 1)), np.zeros((rows, 3))
+    else:  # a shorter path than that of another tool rests at its last row
+        at = np.minimum(np.arange(rows), len(path.translation) - 1)
+        rotation, translation = (np.asarray(v)[at] for v in (path.rotation, path.translation))
     return MovingTool(
         name=name,
         triangles=None if shape is None else tool_triangles(shape),
-        rotation=np.tile(np.eye(3), (rows, 1, 1)) if still else np.asarray(path.rotation),
-        translation=np.zeros((rows, 3)) if still else np.asarray(path.translation),
+        rotation=rotation,
+        translation=translation,
         nearest=np.nan_to_num(away, nan=np.inf).argmin(axis=1),
         at_contact={"force": own("force"), "s": s, "phi": phi},
     )

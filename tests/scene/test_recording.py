@@ -216,7 +216,8 @@ def test_a_long_path_has_few_shapes_and_one_row_is_enough(tmp_path):
 def test_several_tools_move_by_themselves(tmp_path):
     """Each its own node, file and contact point; one of them presses at points and is not seen."""
     one = stored()
-    series, both = one.simulation, {"left": one.path, "right": one.path}
+    series, short = one.simulation, Poses(TURNS[:2], np.asarray(one.path.translation)[:2])
+    both = {"left": short, "right": one.path}
     twice = {n: np.stack([getattr(series, n)] * 2, axis=1) for n in ("s", "phi", "force")}
     twice["s"][:, 1] = 36.0
     given = one._replace(
@@ -227,6 +228,7 @@ def test_several_tools_move_by_themselves(tmp_path):
     document, _ = chunks(tmp_path / "a.glb")
     assert [node["name"] for node in document["nodes"]] == ["trachea", "left"]
     write_vtk(tmp_path, recording)
+    np.testing.assert_array_equal(recording.tools[0].rotation, TURNS[[0, 1, 1, 1]])
     names = {p.name.rpartition("_")[0] for p in (tmp_path / "vtk").iterdir()}
     assert names == {"wall", "tool_1", "contact_1", "contact_2"}
     assert [given.rest["s"][tool.nearest[1]] for tool in recording.tools] == [20.0, 36.0]
