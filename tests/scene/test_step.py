@@ -167,7 +167,7 @@ def test_the_gradient_through_a_contact_history(effects):
         m = dataclasses.replace(material, k_1=material.k_1 * v[2])
         mu = None if scene.friction is None else scene.friction * v[3]
         own = dataclasses.replace(scene, friction=mu)
-        places = jnp.asarray(base) + pressed[:, None] * jnp.stack([v[1], -v[0], v[1] / 2])
+        places = jnp.asarray(base) + pressed[:, None] * jnp.stack([v[1], -v[0], v[1] / 2])[None]
         _, out = jax.lax.scan(lambda s, p: jt.step(own, m, s, turn, p), start, places)
         return jnp.sum(weights * out.force)
 
