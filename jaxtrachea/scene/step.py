@@ -391,9 +391,10 @@ def move_tool(
     side = next_side(state.side, at)
     inside = (side == Side.IN_LUMEN)[None]
     if each is None:
-        after, path, each, held = hold(scene, long_run(material), state, here, inside, rest)
+        # The surface follows the tool where it is, not where it stands on its place.
+        after, stands, each, held = hold(scene, long_run(material), state, here, inside, rest)
         before = None if after.memory is None else Before(after.memory.press, dt=dt)
-        result, press = pressed(scene, material, path, each, held.solve, before)
+        result, press = pressed(scene, material, stands, each, held.solve, before)
         if after.memory is not None:
             memory = after.memory._replace(press=press.history)
             after, press = dataclasses.replace(after, memory=memory), press._replace(history=None)
