@@ -175,7 +175,7 @@ def test_closed_loops_only_lose_what_rubs(session):
 
 @pytest.mark.slow
 def test_many_closed_loops(session):
-    check_loops(session, 40, 1000, 4e-3)
+    check_loops(session, 40, 1000, 1.2e-2)  # not rounding: one loop gives 1 % as its place follows
     for seed in range(40):  # wide ones, round the tube and over several rings
         assert lost_besides(session, closed_loop(seed, 400, OUTER)) > -0.02
 
