@@ -229,9 +229,8 @@ def test_a_state_is_saved_and_time_does_not_run_back(held, started):
         assert all(map(np.array_equal, jax.tree.leaves(after), jax.tree.leaves(end)))
 
 
-@pytest.mark.slow
-def test_another_place_is_at_rest_the_same_is_not(held, started):
-    """After a hold the tool goes up, waits, and presses there or two ring spacings aside."""
+def after_a_wait(held, started):
+    """The last force, by way aside and wait: up after a hold, wait, down there or beside."""
     _, _, run, way, _ = held
     up, down = np.array([75.0, OUTER + 8, 0]), np.array([75.0, OUTER + 2.0, 0])
 
@@ -242,10 +241,23 @@ def test_another_place_is_at_rest_the_same_is_not(held, started):
         dt[-4:] = 0.01, wait, 0.01, 0.0
         return float(run(started[0], way[0], jnp.asarray(places), jnp.asarray(dt))[1].force[-1, 1])
 
-    fresh, soon, late, other = last(0, 1e6), last(0, 0.01), last(0, 200.0), last(20.0, 0.01)
+    return last
+
+
+@pytest.mark.slow
+def test_another_place_is_at_rest_the_same_is_not(held, started):
+    """After a hold the tool goes up, waits, and presses there or two ring spacings aside."""
+    last = after_a_wait(held, started)
+    fresh, soon, other = last(0, 1e6), last(0, 0.01), last(20.0, 0.01)
     assert soon > 0.8 * fresh  # negative: the wall is not yet back
-    np.testing.assert_allclose(late, fresh, rtol=1e-2)  # 200 s in the air as one step: 0.7 %
     assert other < 1.1 * soon
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="a single step of 200 s in the air errs by 0.7 %")
+def test_a_long_wait_in_the_air_forgets(held, started):
+    last = after_a_wait(held, started)
+    np.testing.assert_allclose(last(0, 200.0), last(0, 1e6), rtol=2e-3)
 
 
 @pytest.mark.slow

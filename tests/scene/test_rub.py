@@ -174,8 +174,13 @@ def test_closed_loops_only_lose_what_rubs(session):
 
 
 @pytest.mark.slow
-def test_many_closed_loops(session):
-    check_loops(session, 40, 1000, 1.2e-2)  # not rounding: one loop gives 1 % as its place follows
+@pytest.mark.xfail(strict=True, reason="one loop loses 0.29 %, one gives 0.97 % of its work back")
+def test_many_closed_loops_lose_nothing_else(session):
+    check_loops(session, 40, 1000, 2e-3)
+
+
+@pytest.mark.slow
+def test_wide_closed_loops(session):
     for seed in range(40):  # wide ones, round the tube and over several rings
         assert lost_besides(session, closed_loop(seed, 400, OUTER)) > -0.02
 
