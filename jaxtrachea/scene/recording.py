@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.scene.read import StoredSimulation
-from jaxtrachea.scene.solids import Triangles, rings_on, tool_triangles
+from jaxtrachea.scene.solids import Triangles, nearest_vertices, rings_on, tool_triangles
 from jaxtrachea.scene.stage import Poses
 
 
@@ -108,8 +108,6 @@ def _moving(
         return values if place is None else values[:, place]
 
     rows, s, phi = len(own("s")), own("s"), own("phi")
-    turn = np.asarray(rest["phi"] - phi[:, None] + np.pi) % (2 * np.pi) - np.pi
-    away = np.hypot(rest["s"] - s[:, None], rest["distance"] * turn)
     if path is None:
         rotation, translation = np.tile(np.eye(3), (rows, 1, 1)), np.zeros((rows, 3))
     else:  # a shorter path than that of another tool rests at its last row
@@ -120,6 +118,6 @@ def _moving(
         triangles=None if shape is None else tool_triangles(shape),
         rotation=rotation,
         translation=translation,
-        nearest=np.nan_to_num(away, nan=np.inf).argmin(axis=1),
+        nearest=nearest_vertices(s, phi, rest),
         at_contact={"force": own("force"), "s": s, "phi": phi},
     )

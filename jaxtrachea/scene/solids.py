@@ -14,6 +14,8 @@ from jaxtrachea.contact.shapes import Shape, parts_of
 
 #: Directions on the sphere: a ball of 5 mm is drawn within 0.03 mm.
 DIRECTIONS = 600
+#: Radius that a part without a volume is drawn with, mm.
+THINNEST = 0.05
 
 
 class Triangles(NamedTuple):
@@ -62,15 +64,13 @@ def sphere_directions(count: int = DIRECTIONS) -> Float[np.ndarray, "count 3"]:
 def tool_triangles(tool: Shape, count: int = DIRECTIONS) -> Triangles:
     """The surfaces of a tool's convex parts about its own origin.
 
-    Each is the hull of the support points in `count` directions, so it lies inside the tool by at
-    most 1 - cos of half the angle between directions, times the radius.
+    Each is the hull of the support points in `count` directions and along the axes, so it lies
+    inside the tool by at most 1 - cos of half the angle between directions, times the radius. A
+    point, a line or a plate without a radius is drawn with `THINNEST`.
 
     Args:
-        tool: each part with a volume.
+        tool: -
         count: directions.
-
-    Raises:
-        scipy.spatial.QhullError: a part is a point, a line or a plate without a radius.
     """
     parts = [_triangles(part, count) for part in parts_of(tool)]
     shift = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
@@ -80,14 +80,20 @@ def tool_triangles(tool: Shape, count: int = DIRECTIONS) -> Triangles:
 
 def _triangles(shape: Shape, count: int) -> Triangles:
     """The surface of one convex body."""
-    from scipy.spatial import ConvexHull
+    from scipy.spatial import ConvexHull, QhullError
 
     corners, radius = np.asarray(shape.vertices, float).T, float(shape.radius)
-    points = corners
-    if radius > 0:
-        ways = sphere_directions(count)
-        points = corners[np.argmax(ways @ corners.T, axis=1)] + radius * ways
-    hull = ConvexHull(points)
+
+    def rounded(radius: float) -> np.ndarray:
+        ways = np.concatenate([sphere_directions(count), np.eye(3), -np.eye(3)])
+        return corners[np.argmax(ways @ corners.T, axis=1)] + radius * ways
+
+    points = rounded(radius) if radius > 0 else corners
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):  # flat, or too few corners
+        points = rounded(THINNEST)
+        hull = ConvexHull(points)
     used, faces = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], faces.reshape(hull.simplices.shape)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -137,6 +143,20 @@ def rings_on(s, phi, distance, rings: Mapping[str, Any]) -> tuple[np.ndarray, np
         abs(phi) <= float(rings["half_angle"])
     )
     return ring, np.hypot(away, (distance * phi)[:, None]).argmin(axis=0)
+
+
+def nearest_vertices(s, phi, rest: Mapping[str, np.ndarray]) -> Int[np.ndarray, " rows"]:
+    """Vertex of a wall that is nearest to each place on it; the first where a place is NaN.
+
+    Args:
+        s: of the places along the centreline, mm; shape (rows,).
+        phi: round it, rad; likewise.
+        rest: `s`, `phi` and `distance` of the vertices, mm and rad.
+    """
+    s, phi = (np.asarray(v, float)[:, None] for v in (s, phi))
+    turn = np.asarray(rest["phi"] - phi + np.pi) % (2 * np.pi) - np.pi
+    away = np.hypot(rest["s"] - s, rest["distance"] * turn)
+    return np.nan_to_num(away, nan=np.inf).argmin(axis=1)
 
 
 def crossings(faces: np.ndarray, values: np.ndarray, level: float = 0.0) -> Crossings:

@@ -17,7 +17,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from scipy.spatial import QhullError
 
 from jaxtrachea.files.pictures import plain
 from jaxtrachea.scene.instruments import scene_of
@@ -204,10 +203,7 @@ def _tool(scene: Scene, path: Poses | Presses, row: int) -> Triangles | None:
     """The tool where it stands; None: a press at a point, or a tool without a volume."""
     if scene.tool is None or not isinstance(path, Poses):
         return None
-    try:
-        own = tool_triangles(scene.tool)
-    except QhullError:
-        return None
+    own = tool_triangles(scene.tool)
     turn, place = np.asarray(path.rotation[row], float), np.asarray(path.translation[row], float)
     return own._replace(vertices=own.vertices @ turn.T + place)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.scene.read import SimulationFileError, read_simulation
-from jaxtrachea.scene.solids import rings_on
+from jaxtrachea.scene.solids import nearest_vertices, rings_on
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.viewer.frame import Frame, packet, statuses
 from jaxtrachea.viewer.protocol import frame_of, tube_arrays, tube_of
@@ -78,14 +78,13 @@ def of_file(path: Path, title: str = "") -> str:
         poses[:, 9:] = stored.path.translation
     where = rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)
     arrays = tube_arrays(rest["vertices"], rest["faces"], *where, tool)
+    near = nearest_vertices(series.s, series.phi, rest)
     frames = []
     for i, pose in enumerate(poses):
         given = {name: getattr(series, name) for name in SHOWN}
         row = {name: None if v is None else v[i] for name, v in given.items()}
         if tool is None:
-            turn = (rest["phi"] - series.phi[i] + np.pi) % (2 * np.pi) - np.pi
-            near = np.hypot(rest["s"] - series.s[i], rest["distance"] * turn).argmin()
-            pose = np.concatenate([np.eye(3).ravel(), series.vertices[i, near]])
+            pose = np.concatenate([np.eye(3).ravel(), series.vertices[i, near[i]]])
         frames.append(frame_of(tool, np.nan_to_num(pose), SimpleNamespace(**row), 0.0))
     return _page(title or path.stem, arrays, frames, place=str(path))
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.contact.shapes import Shape, parts_of
-from jaxtrachea.scene.solids import rings_on
+from jaxtrachea.scene.solids import rings_on, tool_triangles
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.viewer.frame import Frame, packet, statuses
@@ -58,7 +58,7 @@ def tube_arrays(
         midline: of each ring, the vertex on the anterior midline.
         tool: about its origin; None: there is none.
     """
-    corners, sides = (np.zeros((0, 3)),) * 2 if tool is None else tool_surface(tool)
+    corners, sides = (np.zeros((0, 3)),) * 2 if tool is None else tool_triangles(tool)
     return {
         "rest": np.asarray(vertices, np.float32), "faces": np.asarray(faces, np.uint32),
         "joints": midline.astype(np.uint32), "tool": corners.astype(np.float32),
@@ -80,41 +80,3 @@ def tube_of(scene: Scene) -> tuple[Any, Any, np.ndarray, np.ndarray]:
              "half_angle": tube.half_angle}  # fmt: skip
     where = rings_on(mesh.s, mesh.phi, mesh.distance, rings)
     return mesh.vertices, mesh.faces, *where
-
-
-def tool_surface(tool: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of a tool with its rounding: corners, mm, and three of them for each side."""
-    corners, sides = zip(*map(_surface, parts_of(tool)), strict=True)
-    shift = np.cumsum([0, *map(len, corners[:-1])])
-    moved = [of + at for of, at in zip(sides, shift, strict=True)]
-    return np.concatenate(corners), np.concatenate(moved)
-
-
-def _surface(tool: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """`tool_surface` of one convex body."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    cores, radius = np.asarray(tool.vertices, float).T, float(tool.radius)
-    points = (cores[:, None] + radius * _directions()).reshape(-1, 3) if radius > 0 else cores
-    try:
-        found = ConvexHull(points)
-    except (QhullError, ValueError):  # flat, or too few corners: as thin as it can be seen
-        found = ConvexHull((cores[:, None] + 0.05 * _directions()).reshape(-1, 3))
-    corners, sides = found.points, found.simplices.copy()
-    a, b, c = (corners[sides[:, i]] for i in range(3))
-    inside_out = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0
-    sides[inside_out] = sides[inside_out][:, ::-1]
-    used, numbers = np.unique(sides, return_inverse=True)
-    return corners[used], numbers.reshape(sides.shape)
-
-
-def _directions() -> np.ndarray:
-    """Unit vectors spread evenly over a sphere; shape (600, 3).
-
-    Fibonacci's lattice, and both poles of each axis, so that a tool is as wide as it is.
-    """
-    i = np.arange(594) + 0.5
-    z, turn = 1 - 2 * i / 594, np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z * z)
-    lattice = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
-    return np.concatenate([lattice, np.eye(3), -np.eye(3)])

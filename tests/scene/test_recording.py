@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.scene.gltf import write_glb
 from jaxtrachea.scene.read import StoredSimulation
 from jaxtrachea.scene.recording import NoSurface, recording_of
@@ -232,6 +232,17 @@ def test_several_tools_move_by_themselves(tmp_path):
     names = {p.name.rpartition("_")[0] for p in (tmp_path / "vtk").iterdir()}
     assert names == {"wall", "tool_1", "contact_1", "contact_2"}
     assert [given.rest["s"][tool.nearest[1]] for tool in recording.tools] == [20.0, 36.0]
+
+
+def test_a_tool_without_a_volume_is_drawn_thin(tmp_path):
+    """A plate of four corners has no hull of its own."""
+    corners = np.array([[-2.0, -2, 2, 2], [0, 0, 0, 0], [-3, 3, -3, 3]])
+    plate = Shape(jnp.asarray(corners), jnp.asarray(0.0))
+    recording = recording_of(stored(tool=plate))
+    vertices = recording.tools[0].triangles.vertices
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), [4.1, 0.1, 6.1], atol=1e-9)
+    write_glb(tmp_path / "a.glb", recording)
+    assert len(trimesh.load(tmp_path / "a.glb", process=False).geometry) == 2
 
 
 def test_what_has_no_surface_is_refused():
