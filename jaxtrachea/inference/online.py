@@ -85,9 +85,10 @@ class Online:
     """Unknowns of one specimen, identified sample by sample while it is pressed on the midline.
 
     All is compiled when it is made; a sample compiles nothing (but where a ninth position, a
-    seventeenth, ... leaves the structure in doubt), and takes about as long whether it is the tenth or
-    the ten-thousandth (15 to 30 % more). Samples are evaluated in JAX's precision, sums and steps in float64; without
-    `jax_enable_x64` estimates are rough, and a warning says so, as for `fit`.
+    seventeenth, ... leaves the structure in doubt), and takes about as long whether it is the tenth
+    or the ten-thousandth (15 to 30 % more). Samples are evaluated in JAX's precision, sums and
+    steps in float64; without `jax_enable_x64` estimates are rough, and a warning says so, as for
+    `fit`.
 
     Every sample weighs the same, with the noise that is given. Zeros are those of the records: an
     `auto` onset or force offset stays at 0. When a press ends (`press`, `settle`) its record is
