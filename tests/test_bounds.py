@@ -41,9 +41,9 @@ def parted_from_bounds(study, theta):
 def check_lanes(count):
     study, start = bounded.random_study(11, count)
     sigma = first_sigma(study)
-    solved = levenberg_marquardt(LaneCost(study.model, study.lanes, sigma), start, dtype=dtype)
+    solved = levenberg_marquardt(LaneCost(study.model, study.lanes, sigma), start)
     assert np.all(solved.status == FitStatus.CONVERGED), np.bincount(solved.status)
-    assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= promise_allowed(dtype)
+    assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= promise_allowed(np.float64)
     assert not np.any(parted_from_bounds(study, solved.theta))
     return study, sigma, solved
 
