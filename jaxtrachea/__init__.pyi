@@ -38,6 +38,7 @@ from .mechanics.press_contacts import press_contacts as press_contacts
 from .mechanics.press_in_time import press_in_time as press_in_time
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
+from .notebook import load_ipython_extension as load_ipython_extension
 from .prediction.predict import CurvePrediction as CurvePrediction
 from .prediction.predict import predict as predict
 from .relaxation.filter import Relaxation as Relaxation

@@ -5,6 +5,7 @@ differentiation, and the boxes of the texts as matplotlib draws them.
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.text import Text
 
+import jaxtrachea
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.fitted_errors import fitted_errors
 from jaxtrachea.fitting.lanes import Noise
@@ -29,7 +31,7 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.captions import captions
 from jaxtrachea.report.fit_pictures import draw_force, draw_joints, scale_of
-from jaxtrachea.report.plots import STYLE, _draw_bands, _scale, draw_residuals
+from jaxtrachea.report.plots import STYLE, _draw_bands, _scale, draw_residuals, draw_waterfall
 from jaxtrachea.report.shown import Shown
 from jaxtrachea.trachea.geometry import table_1
 
@@ -239,6 +241,43 @@ def test_captions_follow_what_was_observed(one, many, dense_result):
     seen = dataclasses.replace(one.residuals, side_force=one.residuals.force)
     both = dataclasses.replace(one, stored_residuals=seen)
     assert list(captions(both)) == ["fit", "side_force", "correlation"]
+
+
+def test_a_waterfall_shows_starts_that_ended_elsewhere(one):
+    """A problem with one minimum has no such picture; starts of equal cost lie below the line."""
+    np.testing.assert_allclose(one.start_costs[0, 0], one.cost[0], rtol=1e-9)
+    assert np.isnan(one.start_costs[0, 1:]).all()
+    costs = np.full((1, 24), np.nan)
+    costs[0, :4] = 2.0 * np.array([1.0, 1.0, 1.5, 11.0])
+    other = dataclasses.replace(
+        one, start_costs=costs, tried=np.array([4]), converged_starts=np.array([2])
+    )
+    assert list(captions(other)) == ["fit", "waterfall", "correlation"]
+    with mpl.rc_context(STYLE):
+        figure = draw_waterfall(other)
+        assert not overlaps(figure)
+    (axis,) = figure.axes
+    drawn, line = (np.asarray(v.get_ydata(), float) for v in axis.lines)
+    assert (drawn[:2] < line[0]).all()
+    np.testing.assert_allclose(drawn[2:], [0.5, 10.0])
+
+
+def test_the_stages_of_a_fit_are_logged(one, caplog):
+    caplog.set_level("INFO", "jaxtrachea")
+    fit(one.study, ONE)
+    assert caplog.messages[0] == "1 fits of 2 unknowns, 1 starts each"
+
+
+def test_a_notebook_shows_a_fit_as_table_and_picture(one):
+    """What `%load_ext jaxtrachea` tells IPython."""
+    shown: dict = {}
+    formatter = SimpleNamespace(for_type=shown.__setitem__)
+    shell = SimpleNamespace(display_formatter=SimpleNamespace(formatters={"text/html": formatter}))
+    jaxtrachea.load_ipython_extension(shell)
+    assert set(shown) == {jaxtrachea.FitResult, jaxtrachea.Scene, jaxtrachea.Simulation}
+    text = shown[jaxtrachea.FitResult](one)
+    assert "<td>k_1</td>" in text
+    assert text.count('<img src="data:image/png;base64,') == 1
 
 
 def test_curves_left_out_are_drawn_as_they_are_predicted(one):

@@ -31,7 +31,7 @@ ORDER = [
     {"results"},
     {"prediction", "runs"},
     {"report"},
-    {"tradeoff", "viewer"},
+    {"tradeoff", "viewer", "notebook"},
     {"cli"},
     {"__main__"},
 ]

@@ -48,7 +48,9 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
     with ThreadPoolExecutor(1) as beside:
         # The program that `simulate` will load is compiled while the operations are counted.
         kept = beside.submit(Traced(run).compile, staged.scene, staged.material, staged.path)
-        whole, found = shares(staged)
+        with progress_bar(transient=True) as bar:
+            bar.add_task("counting operations", total=None)
+            whole, found = shares(staged)
         out.print(table(words("Plan", head, plan_rows(staged.scene.plan, found), ("reason",))))
         out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
         with progress_bar(transient=True) as bar:
@@ -93,21 +95,26 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
             load_beside("trimesh")
         if spec.output.pictures:
             load_beside("jaxtrachea.scene.surface_plot")
-        out = jax.block_until_ready(Traced(run)(staged.scene, staged.material, staged.path))
-        clock.append(time.perf_counter())
-        stop_if_asked()
-        title = spec.title or scene.stem
-        with beside(_draw, folder, title, spec.output.pictures, staged, out) as drawing:
-            write_meshes(folder, staged.scene, out)
-            write_forces(folder / "forces.csv", out, staged.scene.names)
-            made = _provenance(scene, staged, clock)
-            motion = staged.material, staged.path
-            write_simulation(folder / "simulation.h5", staged.scene, *motion, out, made)
-            lost = _write_play(folder, title) if spec.output.play else {}
-            if spec.output.vtk or spec.output.animation:
-                _write_recording(folder, spec.output)
-            _write_json(folder, made)
-            say_lost(drawing.result() | lost)
+        with progress_bar(transient=True) as bar:
+            stages = Stages(bar, stop_if_asked)
+            stages.begin(f"pressing {_rows(staged)} rows; a new kind of scene is compiled first")
+            out = jax.block_until_ready(Traced(run)(staged.scene, staged.material, staged.path))
+            clock.append(time.perf_counter())
+            stop_if_asked()
+            stages.begin("drawing and writing")
+            title = spec.title or scene.stem
+            with beside(_draw, folder, title, spec.output.pictures, staged, out) as drawing:
+                write_meshes(folder, staged.scene, out)
+                write_forces(folder / "forces.csv", out, staged.scene.names)
+                made = _provenance(scene, staged, clock)
+                motion = staged.material, staged.path
+                write_simulation(folder / "simulation.h5", staged.scene, *motion, out, made)
+                lost = _write_play(folder, title) if spec.output.play else {}
+                if spec.output.vtk or spec.output.animation:
+                    _write_recording(folder, spec.output)
+                _write_json(folder, made)
+                lost |= drawing.result()
+        say_lost(lost)
     _print_rows(out, staged.scene.names)
     failed = _print_failures(out.status, "row(s)")
     for note in staged.notes:
@@ -130,12 +137,16 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     from jaxtrachea.scene.plots import draw_sweep
     from jaxtrachea.scene.results import write_sweep
     from jaxtrachea.scene.sweep import sweep as run
+    from jaxtrachea.scene.vtk_files import write_map
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
     want = spec.sweep
     if want is None:
         raise Stop(f"{scene}: sweep: missing; give a table [sweep] with a depth")
+    for name in ("s_count", "phi_count") if spec.output.vtk else ():
+        if getattr(want, name) < 2:
+            raise Stop(f"{scene}: sweep.{name}: 1; a map for ParaView (output.vtk) needs 2 or more")
     swept, s, phi = _for_sweep(scene, spec, staged)
     points = [v.ravel() for v in np.meshgrid(s, phi, indexing="ij")]
     clock.append(time.perf_counter())
@@ -157,6 +168,8 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         say_lost(save_each(folder, draw_sweep(s, phi, out))[1])
         made = _provenance(scene, staged, clock)
         write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
+        if spec.output.vtk:
+            write_map(folder / "sweep.vtp", swept.mesh, s, phi, out)
         _write_json(folder, made)
     unsolved = int(np.isnan(np.asarray(out.force)).sum())
     console = Console()

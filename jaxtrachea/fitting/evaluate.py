@@ -10,6 +10,7 @@ from jaxtrachea.fitting.covariance import Uncertainty, half_widths
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.lane import forces, markers
+from jaxtrachea.fitting.minima import KEPT
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, precision_unit
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
@@ -42,6 +43,7 @@ def evaluated(study: Study) -> FitResult:
         relative_se=none, at_bound=none.astype(bool),
         status=np.where(finite, FitStatus.CONVERGED, FitStatus.NON_FINITE).astype(int),
         cost=_cost(study, seen, sigma), converged_starts=finite.astype(int),
+        start_costs=np.full((lanes, KEPT), np.nan),
         sigma=sigma * unit, rms=rms, samples=total, criteria=criteria(study, info, finite),
         uncertainty=_no_uncertainty(half), undetermined=none.astype(bool),
         unexamined=none.astype(bool),

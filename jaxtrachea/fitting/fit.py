@@ -1,6 +1,7 @@
 """One fit from study to result: starts, noise levels, best start, what may be believed."""
 
 import dataclasses
+import logging
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -44,6 +45,8 @@ REPLACED = 3
 #: Times that a fit is made again with zeros that it asks for.
 MORE_ZEROS = 3
 
+_log = logging.getLogger(__name__)
+
 
 def fit(
     study: Study,
@@ -61,7 +64,7 @@ def fit(
     offset that the record of a curve does not show (`omitted_zeros`), its lane is fitted again
     with it, and the study of the result has it. Where the noise of forces has a share of the force
     to be found (`Noise.force_share`), the fit is made in turns with it; the study of the result
-    keeps what was found, and refits from it do, too.
+    keeps what was found, and refits from it do, too. Each stage is logged (`logging`, level INFO).
 
     Args:
         study: from `study.build_study`.
@@ -75,6 +78,8 @@ def fit(
         fixed) nothing is solved: the model is evaluated.
     """
     check_precision(settings)
+    lanes = len(study.curves)
+    _log.info("%d fits of %d unknowns, %d starts each", lanes, study.size, settings.starts)
     if study.size == 0:
         return evaluated(study)
     result = _without_more_zeros(study, settings, progress, starts, beside)
@@ -104,6 +109,7 @@ def with_omitted_zeros(
             break
         study = with_zeros(study, asked.names)
         near = near_estimates(result, study, asked)
+        _log.info("%d curves ask for an onset or an offset; fitted again", len(asked.names))
         rows = np.flatnonzero([any(_key(c) in asked.names for c in lane) for lane in study.curves])
         new = _without_more_zeros(study.take(rows), settings, alive, None, near[rows])
         result = merged(with_found_shares(study, result.study, rows, new.study), result, rows, new)
@@ -152,6 +158,7 @@ def _with_force_share(found: _Found, settings: Settings, progress) -> _Found:
                 none = dataclasses.replace(result.study, force_share=None)
                 result = dataclasses.replace(result, study=none)
             break
+        _log.info("%d fits again with a share of the force in the noise", len(rows))
         study = with_levels(result.study, levels, force)
         part = study if len(rows) == result.lanes else study.take(rows)
         again = _lowest(part, settings, alive, None, result.theta[rows])
@@ -195,6 +202,7 @@ def _verified(result, minima: Minima, known: Structure, settings, progress) -> F
         doubts = needs_review(result, minima)
         if not doubts.any():
             break
+        _log.info("%d fits give cause for doubt; profiles, other minima", doubts.any(1).sum())
         evidence, better = verify_minimum(
             result, minima, doubts, settings, known, progress, last=not turns_left
         )
@@ -266,7 +274,8 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         study=study, theta=theta, value=value, standard_error=standard_error,
         lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
-        converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms, samples=samples,
+        converged_starts=agree, tried=tried,
+        start_costs=minima.start_costs(), sigma=sigma * unit, rms=rms, samples=samples,
         criteria=criteria(study, info, alive),
         uncertainty=u, undetermined=structure.undetermined,
         unexamined=np.zeros(theta.shape, bool), evidence_low=np.full(theta.shape, np.nan),

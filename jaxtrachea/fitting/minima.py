@@ -23,6 +23,10 @@ from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marqua
 from jaxtrachea.status import FitStatus
 
 
+#: Costs of starts that a result keeps of a lane.
+KEPT = 24
+
+
 class Minima(NamedTuple):
     """The best of all starts of every lane, and where the others ended.
 
@@ -44,6 +48,16 @@ class Minima(NamedTuple):
     lane: np.ndarray
     end: np.ndarray
     cost: np.ndarray
+
+    def start_costs(self) -> Float[np.ndarray, "lanes KEPT"]:
+        """The lowest costs that starts of each lane ended at, lowest first; NaN where no more."""
+        out = np.full((len(self.agree), KEPT), np.nan)
+        order = np.lexsort((self.cost, self.lane))
+        lane = self.lane[order]
+        rank = np.arange(len(lane)) - np.searchsorted(lane, lane)
+        kept = rank < KEPT
+        out[lane[kept], rank[kept]] = self.cost[order][kept]
+        return np.where(np.isfinite(out), out, np.nan)
 
     def without_ends(self, lanes: np.ndarray) -> "Minima":
         """Without where starts of these lanes ended, which is worth nothing with another noise."""

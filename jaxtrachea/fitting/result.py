@@ -92,6 +92,8 @@ class FitResult:
         converged_starts: starts that ended in the best minimum; of many long curves (`few_samples`)
             those that came together on a few samples went there as one; (lanes,).
         tried: starts in all; (lanes,).
+        start_costs: the 24 lowest costs that starts of a lane ended at, with the noise that fits
+            begin with, lowest first; NaN where there are no more; (lanes, 24).
         sigma: standard deviation of force (N) and markers (mm), given (the median of the lane's
             samples) or estimated; (lanes, 2).
         rms: root mean square residual of force (N) and markers (mm); (lanes, 2).
@@ -126,6 +128,7 @@ class FitResult:
     cost: np.ndarray
     converged_starts: np.ndarray
     tried: np.ndarray
+    start_costs: np.ndarray
     sigma: np.ndarray
     rms: np.ndarray
     samples: np.ndarray

@@ -16,6 +16,8 @@ def captions(result: FitResult) -> dict[str, str]:
         found["side_force"] = "side force and fit"
     if not few:  # else they stand under the curves
         found["residuals"] = "residuals of the force"
+    if (result.converged_starts < result.tried).any():
+        found["waterfall"] = "where the starts ended, lowest first"
     if result.study.free:
         found["correlation"] = "correlation of the estimates"
     return found

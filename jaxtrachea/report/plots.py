@@ -7,10 +7,12 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxtrachea.files.pictures import STYLE, of_all, plain, save_each
 from jaxtrachea.fitting.result import FitResult, unknown_label
 from jaxtrachea.inference.analysis import AnalysisResults
+from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
 from jaxtrachea.report.captions import captions
 from jaxtrachea.report.fit_pictures import draw_force, draw_joints
@@ -18,6 +20,8 @@ from jaxtrachea.report.shown import Shown, along, position_signs
 
 #: Residuals that bands are made of at most, intervals of displacement, and samples in one at least.
 BANDED, BINS, FEWEST = 400_000, 60, 20
+#: Lanes of a waterfall at most; share of the cost up to which two starts end in one minimum.
+FALLS, SAME = 8, 1e-6
 
 
 def draw_all(
@@ -39,6 +43,7 @@ def draw_all(
         "joints": partial(draw_joints, shown),
         "side_force": partial(draw_force, shown, "side_force"),
         "residuals": partial(draw_residuals, shown),
+        "waterfall": partial(draw_waterfall, findings.result),
         "correlation": partial(draw_correlation, findings.result),
     }
     mine = {f"{name}.png": drawings[name] for name in captions(findings.result)}
@@ -109,6 +114,37 @@ def draw_residuals(shown: Shown):
     right.hist(np.clip(values, -limit, limit), bins=np.linspace(-limit, limit, 61), color="0.4")
     more = f"{beyond} of {len(values)} beyond the scale" if beyond else ""
     right.set(xlabel="residual / peak [%]", ylabel="samples", title=more)
+    return figure
+
+
+def draw_waterfall(result: FitResult):
+    """Cost of every start over that of the best, lowest first; those below `SAME` are one minimum.
+
+    Of many lanes those are drawn whose starts agree least.
+    """
+    share = result.converged_starts / result.tried
+    rows = np.argsort(share, kind="stable")[:FALLS]
+    rows = rows[share[rows] < 1].tolist()
+    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    axis = figure.subplots()
+    for lane in rows:
+        costs = result.start_costs[lane]
+        costs = costs[np.isfinite(costs)]
+        low = costs[0] if len(costs) and costs[0] > 0 else 1.0
+        excess = np.maximum(costs / low - 1, SAME / 10)
+        agree = f"{result.converged_starts[lane]} of {result.tried[lane]} agree"
+        label = plain(f"{lane_label(result, lane)}: {agree}")
+        axis.plot(np.arange(len(costs)) + 1, excess, "o-", ms=3.5, lw=0.9, label=label)
+    axis.axhline(SAME, color="0.5", ls="--", lw=0.9)
+    axis.set_yscale("log")
+    axis.set(
+        xlabel="start, lowest first",
+        ylabel="cost over that of the best - 1",
+        ylim=(SAME / 20, None),
+        title=f"starts of {len(rows)} of {result.lanes} fits; below the dashed line: one minimum",
+    )
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.legend(fontsize=7)
     return figure
 
 

@@ -18,7 +18,7 @@ from jaxtrachea.results.arrays import PLACES, arrays_of
 from jaxtrachea.status import FitStatus
 
 SCHEMA = "jaxtrachea-results"
-VERSION = 4
+VERSION = 5
 
 
 def write_hdf5(

@@ -403,7 +403,8 @@ class OutputSection(Section):
     play: bool = False
     """play.html: the simulation as a page that plays in any browser (extra `viewer`)"""
     vtk: bool = False
-    """simulation.pvd: wall, tool and contact force in every row, for ParaView"""
+    """simulation.pvd: wall, tool and contact force in every row; sweep.vtp: the maps of a sweep on
+    the wall; for ParaView"""
     animation: bool = False
     """simulation.glb: the simulation as an animation for slides and 3-D viewers"""
 

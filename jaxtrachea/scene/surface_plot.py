@@ -127,6 +127,27 @@ def draw_surface(
     return figure
 
 
+def draw_rest(scene: Scene) -> Figure:
+    """The tube at rest with its rings, from the front and the side; its colour has no meaning.
+
+    Args:
+        scene: with a mesh.
+    """
+    mesh = scene.mesh
+    assert mesh is not None
+    wall = Triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
+    frame = np.eye(3)
+    if mesh.frames is not None:
+        frame = np.asarray(mesh.frames[np.argmin(np.abs(mesh.s - scene.geometry.length / 2))])
+    camera = _camera(frame)
+    figure = Figure(figsize=(9.0, 4.4), dpi=90)
+    axis = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    pale = np.full(len(wall.vertices), 0.6)
+    ends = _draw_solids(axis, camera, wall, None, pale, inside_rings(scene, mesh))
+    _frame_view(axis, camera, frame, *ends)
+    return figure
+
+
 def _of_each(scene: Scene, path: Any, out: Simulation):
     """Scene, path and result of every tool."""
     if not scene.instruments:
@@ -229,9 +250,13 @@ def inside_rings(scene: Scene, mesh: Mesh) -> np.ndarray:
     return np.minimum(height / 2 - away, beyond)
 
 
-def _camera(contact: Contact) -> np.ndarray:
-    """Rows right, up and towards the viewer: the larynx is right, the contact's normal is up."""
-    along, normal, aside = contact.axes.T
+def _camera(axes: np.ndarray) -> np.ndarray:
+    """Rows right, up and towards the viewer: the larynx is right, the contact's normal is up.
+
+    Args:
+        axes: along the tube, the normal and the third as columns.
+    """
+    along, normal, aside = axes.T
     towards = np.cos(ASIDE) * normal + np.sin(ASIDE) * aside + TILT * along
     towards /= np.linalg.norm(towards)
     up = normal - (normal @ towards) * towards
@@ -250,7 +275,19 @@ def _shade(triangles: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.nd
 def _draw_view(axis: Any, wall, rest, tool, contacts, share, rings, outline) -> None:
     """The tube, its tools and their forces, projected."""
     contact = contacts[0]
-    camera = _camera(contact)
+    camera = _camera(contact.axes)
+    low, high = _draw_solids(axis, camera, wall, tool, share, rings)
+    _draw_rest(axis, rest @ camera.T, wall.faces, share)
+    if outline is not None:
+        print_ = outline @ camera.T
+        axis.add_collection(LineCollection(list(print_[:, :, :2]), colors="k", linewidths=1.1))
+    ends = np.concatenate([_draw_force(axis, camera, own) for own in contacts])
+    low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
+    _frame_view(axis, camera, contact.frame, low, high)
+
+
+def _draw_solids(axis: Any, camera: np.ndarray, wall, tool, share, rings):
+    """Wall with the edges of its rings, and tool, projected; corners of what is drawn."""
     seen = wall.vertices @ camera.T
     triangles = seen[wall.faces]
     light, front = _shade(triangles, camera)
@@ -276,20 +313,18 @@ def _draw_view(axis: Any, wall, rest, tool, contacts, share, rings, outline) -> 
     turned = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     edge = crossings(wall.faces[turned[:, 2] > 0], rings).at(seen)
     axis.add_collection(LineCollection(list(edge[:, :, :2]), colors=RING, linewidths=0.7))
-    _draw_rest(axis, rest @ camera.T, wall.faces, share)
-    if outline is not None:
-        print_ = outline @ camera.T
-        axis.add_collection(LineCollection(list(print_[:, :, :2]), colors="k", linewidths=1.1))
-    low, high = triangles.reshape(-1, 3).min(axis=0)[:2], triangles.reshape(-1, 3).max(axis=0)[:2]
+    points = triangles.reshape(-1, 3)[:, :2]
     if tool is not None:
-        points = (tool.vertices @ camera.T)[:, :2]
-        low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
-    ends = np.concatenate([_draw_force(axis, camera, own) for own in contacts])
-    low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
+        points = np.concatenate([points, (tool.vertices @ camera.T)[:, :2]])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _frame_view(axis: Any, camera: np.ndarray, frame: np.ndarray, low, high) -> None:
+    """Limits with room for the scale bar and the directions."""
     low = low - (2, 15)
     axis.set(xlim=(low[0], high[0] + 2), ylim=(low[1], high[1] + 3), aspect="equal")
     axis.set_axis_off()
-    _draw_scale(axis, camera, contact, low, high)
+    _draw_scale(axis, camera, frame, low, high)
 
 
 def _draw_rest(axis: Any, seen: np.ndarray, faces: np.ndarray, share: np.ndarray) -> None:
@@ -324,12 +359,12 @@ def _draw_force(axis: Any, camera: np.ndarray, contact: Contact) -> np.ndarray:
     return np.stack([tip, far + (0, 5)])
 
 
-def _draw_scale(axis: Any, camera: np.ndarray, contact: Contact, low, high) -> None:
+def _draw_scale(axis: Any, camera: np.ndarray, frame: np.ndarray, low, high) -> None:
     """A bar of 10 mm, and the directions of the tube by name."""
     x, y = low[0] + 2, low[1] + 3.5
     axis.plot([x, x + 10], [y, y], "k", lw=3, solid_capstyle="butt")
     axis.text(x + 5, y - 1, "10 mm", ha="center", va="top", fontsize=8)
-    ways = 6 * (camera[:2] @ contact.frame).T
+    ways = 6 * (camera[:2] @ frame).T
     origin = np.array([high[0] - 14, low[1] + 3.5 - min(0.0, ways[:, 1].min())])
     arrow = {"arrowstyle": "->", "color": "0.25", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
     for name, way in zip(("to the larynx", "anterior", "lateral (z)"), ways, strict=True):
@@ -342,7 +377,7 @@ def _draw_scale(axis: Any, camera: np.ndarray, contact: Contact, low, high) -> N
 
 def _draw_joints(axis: Any, scene: Scene, mesh: Mesh, vertices, contact, ends) -> None:
     """Joints on the anterior midline, where it faces the viewer."""
-    camera = _camera(contact)
+    camera = _camera(contact.axes)
     if camera[2] @ contact.frame[:, 1] < 0.05:
         return
     for s in np.asarray(scene.geometry.ring_positions, float):

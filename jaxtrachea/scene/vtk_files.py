@@ -12,6 +12,8 @@ import numpy as np
 
 from jaxtrachea.files.atomic import write_text
 from jaxtrachea.scene.recording import Recording
+from jaxtrachea.scene.sweep import Sweep
+from jaxtrachea.trachea.mesh import Mesh
 
 #: VTK's name of a dtype, and the dtype that is written.
 _KINDS = {"f": ("Float32", "<f4"), "i": ("Int32", "<i4"), "u": ("UInt8", "u1")}
@@ -60,6 +62,34 @@ def write_vtk(folder: Path, recording: Recording) -> None:
     write_text(
         folder / "simulation.pvd", _file("Collection", f"<Collection>\n{body}\n</Collection>")
     )
+
+
+def write_map(path: Path, mesh: Mesh, s: np.ndarray, phi: np.ndarray, out: Sweep) -> None:
+    """Write the wall at rest with a sweep's force (N), compliance (mm/N) and the others.
+
+    Linear between the points of the grid; NaN beyond it, and beside a point without a solution.
+
+    Args:
+        path: of a .vtp file.
+        mesh: of the scene.
+        s: of the grid, mm; 2 or more.
+        phi: of the grid, rad; 2 or more.
+        out: of its points, s by s.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    from scipy.interpolate import RegularGridInterpolator
+
+    places = np.stack([np.asarray(mesh.s, float), np.asarray(mesh.phi, float)], axis=1)
+    values = {
+        name: RegularGridInterpolator(
+            (s, phi), np.asarray(v, float).reshape(len(s), len(phi)), bounds_error=False
+        )(places)
+        for name, v in out._asdict().items()
+        if name != "status"
+    }
+    write_text(path, _surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), values))
 
 
 def _surface(points, faces, at_points: Mapping[str, np.ndarray]) -> str:

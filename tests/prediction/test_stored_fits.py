@@ -48,9 +48,9 @@ def test_everything_comes_back_from_the_file(study, read):
 
 
 def old(folder):
-    """As schema 3 was written: the arrays of the lanes were not kept."""
+    """Of a version that kept less."""
     with h5py.File(folder / "results.h5", "r+") as file:
-        file.attrs["schema_version"] = 3
+        file.attrs["schema_version"] = 4
         del file["study"]
 
 
@@ -61,7 +61,7 @@ def cut(folder):
 
 def newer(folder):
     with h5py.File(folder / "results.h5", "r+") as file:
-        file.attrs["schema_version"] = 5
+        file.attrs["schema_version"] = 6
 
 
 def other(folder):
@@ -103,9 +103,9 @@ def unfinished(folder):
 @pytest.mark.parametrize(
     ("harm", "says"),
     [
-        (old, "schema version 3 does not keep .* fit again with this version"),
+        (old, "schema version 4 does not keep .* fit again with this version"),
         (cut, "damaged"),
-        (newer, "schema version is 5, this program reads 4"),
+        (newer, "schema version is 6, this program reads 5"),
         (other, "expected 'jaxtrachea-results'"),
         (without_model, "no dataset 'description'"),
         (not_json, "damaged or not written by this program"),

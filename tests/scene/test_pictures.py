@@ -9,12 +9,13 @@ import pytest
 from matplotlib.text import Text
 
 from jaxtrachea.contact.shapes import box, capsule, sphere
+from jaxtrachea.notebook import of_scene, of_simulation
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.plots import draw_series
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.solids import crossings, tool_distance, tool_triangles
 from jaxtrachea.scene.spec import load_scene_spec
-from jaxtrachea.scene.surface_plot import draw_surface
+from jaxtrachea.scene.surface_plot import draw_rest, draw_surface
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.mesh import volume
 
@@ -107,6 +108,19 @@ def test_nothing_overlaps(shown):
         ]
         for (a, first), (b, second) in itertools.combinations(boxes, 2):
             assert not first.overlaps(second), (a, b)
+
+
+def test_a_notebook_shows_a_scene_and_its_forces(shown):
+    """The plan with its reasons and the tube at rest; normal force over the rows."""
+    scene, _, out = shown
+    figure = draw_rest(scene)
+    figure.draw_without_rendering()
+    words = [t.get_text() for t in texts(figure)]
+    assert {"10 mm", "to the larynx", "anterior"} <= set(words)
+    text = of_scene(scene)
+    assert "<td>skeleton</td>" in text
+    for page in (text, of_simulation(out)):
+        assert page.count('<img src="data:image/png;base64,') == 1
 
 
 def test_no_contact_is_told_in_words(shown):

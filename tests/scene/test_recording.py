@@ -16,7 +16,9 @@ from jaxtrachea.scene.recording import NoSurface, recording_of
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.spec import OutputSection
 from jaxtrachea.scene.stage import Poses
-from jaxtrachea.scene.vtk_files import write_vtk
+from jaxtrachea.scene.sweep import Sweep
+from jaxtrachea.scene.vtk_files import write_map, write_vtk
+from jaxtrachea.trachea.mesh import Mesh
 
 ROWS = 4
 TURNS = Rotation.from_euler("y", [[0], [100], [200], [300]], degrees=True).as_matrix()
@@ -103,6 +105,33 @@ def test_paraviews_files_are_read_by_vtk(vtk, tmp_path):
     index = (tmp_path / "simulation.pvd").read_text()
     assert index.count("<DataSet") == 10
     assert '<DataSet timestep="0.5" part="1" name="tool" file="vtk/tool_0002.vtp"/>' in index
+
+
+def test_a_map_on_the_wall_is_read_by_vtk(vtk, tmp_path):
+    """Linear between the points of the grid, nothing beyond it."""
+    from vtkmodules.util import numpy_support as convert
+
+    rest = stored().rest
+    s, phi = np.linspace(10.0, 30.0, 5), np.linspace(-1.0, 1.0, 3)
+    force = (0.1 + 0.02 * s[:, None] + 0.3 * phi).ravel()
+    out = Sweep(force, force, np.where(force > 0.6, np.nan, 1.0), force, np.zeros(15, int))
+    names = ("vertices", "faces", "s", "phi", "distance")
+    wall = Mesh(**{k: jnp.asarray(rest[k]) for k in names}, normals=jnp.asarray(rest["vertices"]))
+    write_map(tmp_path / "sweep.vtp", wall, s, phi, out)
+    reader = vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(tmp_path / "sweep.vtp"))
+    reader.Update()
+    named = reader.GetOutput().GetPointData()
+    assert named.GetNumberOfArrays() == 4
+    got = convert.vtk_to_numpy(named.GetArray("force"))
+    inside = (rest["s"] >= 10) & (rest["s"] <= 30) & (np.abs(rest["phi"]) <= 1)
+    assert inside.sum() > 20
+    expected = 0.1 + 0.02 * rest["s"] + 0.3 * rest["phi"]
+    np.testing.assert_allclose(got[inside], expected[inside], rtol=1e-6)
+    assert np.isnan(got[~inside]).all()
+    lost = np.isnan(convert.vtk_to_numpy(named.GetArray("compliance")))
+    assert lost[expected > 0.8].all()
+    assert not lost[inside & (expected < 0.3)].any()
 
 
 def test_the_animation_plays_in_vtk(vtk, tmp_path):
