@@ -4,6 +4,7 @@ import base64
 import io
 from typing import Any
 
+import jax
 import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -49,8 +50,7 @@ def of_simulation(out: Simulation) -> str:
     """Force, indentation and motion of the skeleton, row by row, as HTML."""
     several = np.asarray(out.s).ndim == 2
     if not several:
-        fields = {n: v if v is None else np.asarray(v)[:, None] for n, v in out._asdict().items()}
-        out = Simulation(**fields)
+        out = jax.tree.map(lambda v: np.asarray(v)[:, None], out)
     names = [f"tool {j + 1}" for j in range(out.s.shape[1])] if several else ["tool"]
     return _picture(draw_tools(names, out))
 

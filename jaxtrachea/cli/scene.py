@@ -168,8 +168,8 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         say_lost(save_each(folder, draw_sweep(s, phi, out))[1])
         made = _provenance(scene, staged, clock)
         write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
-        if spec.output.vtk:
-            write_map(folder / "sweep.vtp", swept.mesh, s, phi, out)
+        if spec.output.vtk and (mesh := staged.scene.mesh) is not None:
+            write_map(folder / "sweep.vtp", mesh, s, phi, out)
         _write_json(folder, made)
     unsolved = int(np.isnan(np.asarray(out.force)).sum())
     console = Console()

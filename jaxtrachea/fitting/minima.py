@@ -22,7 +22,6 @@ from jaxtrachea.optimisation.batching import NEXT
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.status import FitStatus
 
-
 #: Costs of starts that a result keeps of a lane.
 KEPT = 24
 
