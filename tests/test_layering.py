@@ -137,9 +137,9 @@ WITHIN = {
                    {"plots", "tables"}, {"report"}],
     "runs": [{"manifest"}, {"shards"}, {"folder"}, {"rerun", "checkpoint"}, {"cluster"}],
     "tradeoff": [
-        {"calls", "errors", "front", "levels", "load"},
-        {"ladders", "parts", "plots", "cost"},
-        {"page", "timing", "trial"},
+        {"calls", "errors", "levels", "load", "table"},
+        {"ladders", "parts", "cost"},
+        {"timing", "trial"},
         {"choice"},
         {"measure"},
     ],

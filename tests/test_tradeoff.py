@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 from run_cli import run
+from tradeoff_front import pareto
 from tradeoff_page import choice_rows, fronts
+from tradeoff_plots import QUESTIONS, draw
 from tradeoff_scene import DEPTH, K_1, K_3, SCENE, TOML
 
 from jaxtrachea.config import SpecError
@@ -26,11 +28,9 @@ from jaxtrachea.tradeoff import measure as measuring
 from jaxtrachea.tradeoff.choice import choose
 from jaxtrachea.tradeoff.cost import Cost
 from jaxtrachea.tradeoff.errors import Errors, relative, remesh, spread
-from jaxtrachea.tradeoff.front import pareto
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.plots import QUESTIONS, draw
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -451,7 +451,7 @@ def test_command_writes_every_file(tmp_path, monkeypatch, capsys):
     assert code == 0
     assert "left out: dent: no surface" in out
     names = {path.name for path in Path("made").iterdir()}
-    assert names == {"tradeoff.jsonl", "tradeoff.md", "tradeoff.png", "provenance.json"}
+    assert names == {"tradeoff.jsonl", "tradeoff.csv", "provenance.json"}
     rows = [json.loads(line) for line in Path("made/tradeoff.jsonl").read_text().splitlines()]
     error = {(r["ladder"], r["level"]): r["errors"] for r in rows if "errors" in r}
     assert error["form", "reactions"]["force"] < 1e-9

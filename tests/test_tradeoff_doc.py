@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 from tradeoff_page import read
-
-from jaxtrachea.tradeoff.page import measured
+from tradeoff_text import measured
 
 BENCH = Path(__file__).parent / "bench" / "tradeoff.py"
 FOLDER = Path(__file__).parents[1] / "docs" / "evidence" / "tradeoff"

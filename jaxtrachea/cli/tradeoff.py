@@ -1,7 +1,6 @@
 """The command `tradeoff`: what every accuracy choice of a scene errs and costs."""
 
 import time
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli.options import OutOption
-from jaxtrachea.cli.terminal import Stop, into, progress_bar, say_lost, table
+from jaxtrachea.cli.terminal import Stop, into, progress_bar, table
 
 SceneArgument = Annotated[
     Path | None, typer.Argument(help="Scene file (default: a ball on the tube of Table 1).")
@@ -60,7 +59,7 @@ def tradeoff(
                     raise
                 raise Stop(f"{data}: {error}") from None
         clock.append(time.perf_counter())
-        _write(folder, name, rows, scene, inputs, clock)
+        _write(folder, rows, scene, inputs, clock)
     _print(rows)
     Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
 
@@ -102,48 +101,40 @@ def measured_curves(data: Path | None):
     return measurements.curves, -1.0 if radius is None else radius, measurements.sha256()
 
 
-def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> None:
+def _write(folder: Path, rows, scene: Path | None, inputs, clock) -> None:
     import json
 
     import jax
 
     from jaxtrachea.files.atomic import write_text
-    from jaxtrachea.files.pictures import save_each, without_lost
     from jaxtrachea.files.provenance import provenance
     from jaxtrachea.tradeoff.levels import BUILT_IN
-    from jaxtrachea.tradeoff.page import lines, scene_text
-    from jaxtrachea.tradeoff.plots import draw
+    from jaxtrachea.tradeoff.table import measured_table
 
     if scene is None:
         scene = folder / "scene.json"
         write_text(scene, json.dumps(BUILT_IN, indent=2) + "\n")
-
-    write_text(folder / "tradeoff.jsonl", lines(rows))
-    picture = "tradeoff.png"
+    text = "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
+    write_text(folder / "tradeoff.jsonl", text)
     points = [row for row in rows if "left_out" not in row]
-    lost = save_each(folder, {picture: partial(draw, points, name)})[1]
-    say_lost(lost)
-    text = f"# {name}\n\n{scene_text(rows, picture)}"
-    write_text(folder / "tradeoff.md", without_lost(text, lost))
+    measured_table(points).write_csv(folder / "tradeoff.csv")
     seconds = {k: clock[i + 1] - clock[i] for i, k in enumerate(("read", "compute"))}
     made = provenance(scene, inputs, str(jax.devices()[0]), "float64, float32", seconds)
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 
 
 def _print(rows) -> None:
-    from jaxtrachea.files.table import words
-    from jaxtrachea.tradeoff.page import HEAD, KINDS, cells
+    from jaxtrachea.tradeoff.load import load_warning
+    from jaxtrachea.tradeoff.table import KINDS, measured_table
 
     out = Console()
     points = [row for row in rows if "left_out" not in row]
-    keep = [i for i, name in enumerate(HEAD) if name not in ("99 %", "compile [s]", "lane [µs]")]
     for kind, title in KINDS.items():
-        body = [cells(point) for point in points if point["kind"] == kind]
-        if body:
-            head = [HEAD[i] for i in keep]
-            shown = [[row[i] for i in keep] for row in body]
-            out.print(table(words(title, head, shown, ("level",))))
+        if of_kind := [point for point in points if point["kind"] == kind]:
+            out.print(table(measured_table(of_kind, title)))
     for row in rows:
         if "left_out" in row:
             text = f"left out: {row['ladder']}: {row['left_out']}"
             out.print(escape(text), highlight=False)
+    for text in load_warning(points[0]["others"]) if points else ():
+        out.print(text, highlight=False)

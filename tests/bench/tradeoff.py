@@ -121,10 +121,10 @@ def together(full, found):
 def scene(name: str, settings, *, only_choices: bool) -> list[dict]:
     """Measure one scene; writes its JSON lines; rows of its choices."""
     from tradeoff_page import read
+    from tradeoff_text import lines
 
     from jaxtrachea.cli.tradeoff import measured_curves
     from jaxtrachea.tradeoff.measure import measure, measure_ladders
-    from jaxtrachea.tradeoff.page import lines
 
     def report(text):
         say(f"{name}: {text}")
@@ -145,8 +145,7 @@ def scene(name: str, settings, *, only_choices: bool) -> list[dict]:
 def pages() -> None:
     """The pictures of all scenes, and the page."""
     from tradeoff_page import read
-
-    from jaxtrachea.tradeoff.plots import draw
+    from tradeoff_plots import draw
 
     for name in (name for name in SCENES if (FOLDER / f"{name}.jsonl").exists()):
         rows = read(FOLDER / f"{name}.jsonl")
@@ -159,8 +158,8 @@ def measure_all(asked) -> None:
     """Everything asked for, a scene at a time."""
     import levels
     from tradeoff_page import read
+    from tradeoff_text import lines
 
-    from jaxtrachea.tradeoff.page import lines
     from jaxtrachea.tradeoff.timing import Settings
 
     FOLDER.mkdir(exist_ok=True)

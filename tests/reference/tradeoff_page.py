@@ -4,9 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from tradeoff_front import front, worst
+from tradeoff_text import measured, micro, scene_text, table
+
 from jaxtrachea.tradeoff.cost import HALF
-from jaxtrachea.tradeoff.front import front, worst
-from jaxtrachea.tradeoff.page import measured, micro, scene_text, table
 
 #: Largest error of the plans of a front, for each pair of columns: those of use, and all.
 WITHIN = (0.1, float("inf"))

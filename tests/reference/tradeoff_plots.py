@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
+from tradeoff_front import error, front, time, worst
 
 from jaxtrachea.files.pictures import STYLE, plain
-from jaxtrachea.tradeoff.front import error, front, time, worst
 
 #: An error up to this is drawn as exact, left of all others.
 EXACT = 1e-17

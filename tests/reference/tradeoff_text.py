@@ -4,16 +4,11 @@ import json
 from typing import Any
 
 from jaxtrachea.tradeoff.load import QUIET
+from jaxtrachea.tradeoff.table import KINDS
 
 HEAD = ["ladder", "level", "force", "joints", "surface", "contact [mm]", "gradient",
         "part [µs]", "call [µs]", "99 %", "part, lane [µs]", "lane [µs]", "gradient [µs]",
         "compile [s]"]  # fmt: skip
-KINDS = {
-    "algebra": "Algebra: another way to the same numbers",
-    "truncation": "Truncation: how far something is computed",
-    "model": "Model: something left out",
-    "together": "Together: plans within a tolerance",
-}
 
 #: What makes two runs different ones.
 WHERE = ("date", "device", "processor", "calls", "lanes", "versions")
