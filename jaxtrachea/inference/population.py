@@ -72,7 +72,7 @@ class Population:
             return {}
         j = int(found[0])
         p = self.parameters[j]
-        value = p.from_scaled(float(self.effects.shrunk[lane, j]))
+        value = p.from_scaled(self.effects.shrunk[lane, j])
         slope = value if p.scale == "log" else p.step
         return {"shrunk": value, "shrunk_se": slope * float(self.effects.shrunk_sd[lane, j])}
 
