@@ -7,7 +7,6 @@ from .fitting.result import FitResult as FitResult
 from .fitting.settings import Settings as Settings
 from .fitting.study import Study as Study
 from .fitting.study import build_study as build_study
-from .fusion import fuse as fuse
 from .inference.bootstrap import bootstrap as bootstrap
 from .inference.online import Online as Online
 from .inference.profile import profiles as profiles
@@ -19,7 +18,6 @@ from .mechanics.beam import Beam as Beam
 from .mechanics.beam import contact_compliance as contact_compliance
 from .mechanics.beam import deflect as deflect
 from .mechanics.bound import BoundPress as BoundPress
-from .mechanics.bound import bind as bind
 from .mechanics.force_law import Law as Law
 from .mechanics.force_law import duffing as duffing
 from .mechanics.friction import Coulomb as Coulomb
