@@ -8,8 +8,10 @@ holds no scatter: a product of small matrices is written as a sum (`_numerics.pr
 of many are found one by one (`_numerics.lowest`).
 """
 
+import functools
 import math
 import os
+import sys
 from collections.abc import Callable
 
 import jax
@@ -30,7 +32,7 @@ REDUCED = 4000
 ALIEN = ("dot_general", "scatter", "sort", "top_k", "cholesky", "triangular_solve", "eig", "lu")
 
 
-def fuse(part: Callable) -> Callable:
+def fuse(part: Callable, *, streams: bool = False) -> Callable:
     """The same function, compiled into a single kernel for one call at a time on a CPU.
 
     A batch (`vmap`), a derivative, another device, and a part that does not fit, is compiled as it
@@ -38,13 +40,17 @@ def fuse(part: Callable) -> Callable:
 
     Args:
         part: from arrays to arrays (or trees of them); closes over nothing that is traced.
+        streams: whether arrays of any size are taken: of a loop whose rounds wait for each other,
+            and each read a slice, there is nothing for a second thread to do.
     """
     if not _SUPPORTED:
         return part
 
+    fused = functools.partial(_fused, part, sys.maxsize if streams else SMALL)
+
     @custom_vmap
     def alone(*given):
-        return jax.lax.platform_dependent(*given, cpu=lambda *v: _fused(part, *v), default=part)
+        return jax.lax.platform_dependent(*given, cpu=fused, default=part)
 
     @alone.def_vmap
     def _(count, has_lanes, *given):
@@ -61,12 +67,12 @@ def fuse(part: Callable) -> Callable:
     return call
 
 
-def _fused(part: Callable, *given):
+def _fused(part: Callable, most: int, *given):
     """The part as a call with the attribute, where it fits."""
     from jax.experimental.xla_metadata import set_xla_metadata  # not of all versions
 
     closed, shape = jax.make_jaxpr(part, return_shape=True)(*given)
-    if not fits(closed.jaxpr):
+    if not fits(closed.jaxpr, most):
         return part(*given)
 
     @jax.jit
@@ -84,15 +90,15 @@ def _fused(part: Callable, *given):
     return jax.tree.unflatten(jax.tree.structure(shape), found)
 
 
-def fits(jaxpr: Jaxpr) -> bool:
-    """Whether all that is computed can be in one kernel, and is small enough for one thread."""
+def fits(jaxpr: Jaxpr, most: int) -> bool:
+    """Whether all that is computed can be in one kernel, and no array has more entries."""
     from jax.extend.core import jaxprs_in_params  # not of all versions
 
-    return _small([*jaxpr.invars, *jaxpr.constvars], SMALL) and all(
+    return _small([*jaxpr.invars, *jaxpr.constvars], most) and all(
         not eqn.primitive.name.startswith(ALIEN)
-        and _small(eqn.outvars, SMALL)
+        and _small(eqn.outvars, most)
         and (not eqn.primitive.name.startswith(("reduce_", "arg")) or _small(eqn.invars, REDUCED))
-        and all(map(fits, jaxprs_in_params(eqn.params)))
+        and all(fits(sub, most) for sub in jaxprs_in_params(eqn.params))
         for eqn in jaxpr.eqns
     )
 

@@ -9,8 +9,8 @@ from run_cli import run
 from scipy.signal import lfilter
 
 from jaxtrachea.fitting import omitted_zeros
+from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.fit import fit, with_omitted_zeros
-from jaxtrachea.fitting.result import assess
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.fitting.zero_messages import sentences_of_fits

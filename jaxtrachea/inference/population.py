@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea.fitting.assessment import DETERMINED, Intervals, assess
 from jaxtrachea.fitting.parameters import Parameter
-from jaxtrachea.fitting.result import DETERMINED, FitResult, Intervals, assess
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verdict import WEAK
 from jaxtrachea.inference.profile import Profiles

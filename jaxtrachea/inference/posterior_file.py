@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
-from jaxtrachea.fitting.result import unknown_label
+from jaxtrachea.fitting.assessment import unknown_label
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.posterior import Posterior
 

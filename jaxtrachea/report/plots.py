@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxtrachea.files.pictures import STYLE, of_all, plain, save_each
-from jaxtrachea.fitting.result import FitResult, unknown_label
+from jaxtrachea.fitting.assessment import unknown_label
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
 from jaxtrachea.report.captions import captions

@@ -125,7 +125,7 @@ class MaterialSection(_keys(VALUES, [name for name, p in VALUES.items() if not p
 
 
 class SectionsSection(_keys(SECTION_VALUES)):
-    """[sections]: see `SectionMaterial`; one value for all rings and spans. A wall may give them."""
+    """[sections]: see `SectionMaterial`; one value for all rings and spans."""
 
     @model_validator(mode="after")
     def _large_enough(self) -> "SectionsSection":

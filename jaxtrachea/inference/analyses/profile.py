@@ -8,7 +8,7 @@ import numpy as np
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.pictures import grid, of_all
 from jaxtrachea.files.table import Column, Interval, Table, number
-from jaxtrachea.fitting.result import unknown_label, within_bounds
+from jaxtrachea.fitting.assessment import unknown_label, within_bounds
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.profile import Profiles, profiles
