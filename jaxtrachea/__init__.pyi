@@ -1,12 +1,13 @@
 """The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
 
+from .curvesion.curves import CurvePrediction as CurvePrediction
+from .fitting.build import build_study as build_study
 from .fitting.fit import fit as fit
 from .fitting.lanes import Noise as Noise
 from .fitting.lanes import Weighting as Weighting
 from .fitting.result import FitResult as FitResult
 from .fitting.settings import Settings as Settings
 from .fitting.study import Study as Study
-from .fitting.study import build_study as build_study
 from .inference.bootstrap import bootstrap as bootstrap
 from .inference.online import Online as Online
 from .inference.profile import profiles as profiles
@@ -36,7 +37,6 @@ from .mechanics.press_contacts import press_contacts as press_contacts
 from .mechanics.press_in_time import press_in_time as press_in_time
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
-from .prediction.predict import CurvePrediction as CurvePrediction
 from .prediction.predict import predict as predict
 from .relaxation.filter import Relaxation as Relaxation
 from .relaxation.steps import Branches as Branches

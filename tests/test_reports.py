@@ -22,13 +22,13 @@ from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
 from jaxtrachea.files.table import Table, quoted, unquoted, words
 from jaxtrachea.fitting.assessment import assess, unknown_label
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.effective import share_independent
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import widened
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, left_out_table
 from jaxtrachea.inference.analyses.influence import (

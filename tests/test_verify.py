@@ -14,11 +14,11 @@ from jaxtrachea.files.table import Table
 from jaxtrachea.fitting import structure as structures
 from jaxtrachea.fitting import verify
 from jaxtrachea.fitting.assessment import assess
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve

@@ -90,12 +90,12 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     """Predictions at chosen positions; returns the exit code."""
     import numpy as np
 
+    from jaxtrachea.curvesion.curves import predict_sources
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.table import Table
     from jaxtrachea.prediction import report, tables
     from jaxtrachea.prediction.plots import draw_predictions
-    from jaxtrachea.prediction.predict import predict_sources
 
     sources, s, depths, aside, times = _asked(stored, texts)
     with into(out_dir, default) as (folder, stop_if_asked):

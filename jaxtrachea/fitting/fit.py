@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtrachea.fitting.build import with_zeros
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.evaluate import evaluated
@@ -31,7 +32,7 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.fitting.starts import scales, unscaled
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
-from jaxtrachea.fitting.study import Study, with_zeros
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verify import verify_minimum
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
@@ -64,7 +65,7 @@ def fit(
     keeps what was found, and refits from it do, too.
 
     Args:
-        study: from `study.build_study`.
+        study: from `build.build_study`.
         settings: how to solve.
         progress: called with (starts finished since the last call, starts in all).
         starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.

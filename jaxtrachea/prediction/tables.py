@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from jaxtrachea.curvesion.curves import CurvePrediction
 from jaxtrachea.measurements.read import BadCurve
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.prediction.held_out import Compared
-from jaxtrachea.prediction.predict import CurvePrediction
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 Row = dict[str, object]
