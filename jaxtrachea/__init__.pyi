@@ -1,6 +1,5 @@
 """The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
 
-from .curvesion.curves import CurvePrediction as CurvePrediction
 from .fitting.build import build_study as build_study
 from .fitting.fit import fit as fit
 from .fitting.lanes import Noise as Noise
@@ -18,7 +17,6 @@ from .measurements.read import read_measurements as read_measurements
 from .mechanics.beam import Beam as Beam
 from .mechanics.beam import contact_compliance as contact_compliance
 from .mechanics.beam import deflect as deflect
-from .mechanics.bound import BoundPress as BoundPress
 from .mechanics.force_law import Law as Law
 from .mechanics.force_law import duffing as duffing
 from .mechanics.friction import Coulomb as Coulomb
@@ -37,6 +35,7 @@ from .mechanics.press_contacts import press_contacts as press_contacts
 from .mechanics.press_in_time import press_in_time as press_in_time
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
+from .prediction.curves import CurvePrediction as CurvePrediction
 from .prediction.predict import predict as predict
 from .relaxation.filter import Relaxation as Relaxation
 from .relaxation.steps import Branches as Branches

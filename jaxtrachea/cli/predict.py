@@ -90,11 +90,11 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     """Predictions at chosen positions; returns the exit code."""
     import numpy as np
 
-    from jaxtrachea.curvesion.curves import predict_sources
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.table import Table
     from jaxtrachea.prediction import report, tables
+    from jaxtrachea.prediction.curves import predict_sources
     from jaxtrachea.prediction.plots import draw_predictions
 
     sources, s, depths, aside, times = _asked(stored, texts)

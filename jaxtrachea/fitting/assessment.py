@@ -2,11 +2,12 @@
 
 Both are decided here and nowhere else (`assess`): terminal, report, tables, results.h5, the
 population and designs all ask. The interval is that of as many samples as are independent
-(`effective`); the one of independent residuals stands beside it.
+(`effective`); the one of independent residuals stands beside it. `result` is always a
+`fitting.result.FitResult`, whose tables are made of this.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,9 +15,6 @@ from jaxtrachea.fitting.branch_times import unsampled_time
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.verdict import verdict
 from jaxtrachea.status import ProfileEnd
-
-if TYPE_CHECKING:
-    from jaxtrachea.fitting.result import FitResult
 
 #: Growth, at most, of the side of a profile that ends where another unknown is on its bound: 95 %
 #: of chi^2 with two degrees of freedom for one. Near such a bound the statistic follows neither
@@ -81,7 +79,7 @@ class Assessment(NamedTuple):
     independent: tuple[float, float]
 
 
-def assess(result: "FitResult", lane: int, i: int, profiles: Intervals | None = None) -> Assessment:
+def assess(result: Any, lane: int, i: int, profiles: Intervals | None = None) -> Assessment:
     """Verdict and interval of an unknown: the one place where both are decided.
 
     Args:
@@ -97,7 +95,7 @@ def assess(result: "FitResult", lane: int, i: int, profiles: Intervals | None = 
     return result.assessments[lane, i]
 
 
-def _assess(result: "FitResult", lane: int, i: int, profiles: Intervals | None) -> Assessment:
+def _assess(result: Any, lane: int, i: int, profiles: Intervals | None) -> Assessment:
     plain_low, plain_high, ends = _unbounded(result, lane, i, profiles)
     independent = within_bounds(result, lane, i, plain_low, plain_high)
     if not result.succeeded[lane]:
@@ -129,7 +127,7 @@ def _finite(value: float) -> float:
     return value if np.isfinite(value) else np.nan
 
 
-def _longer_side(result: "FitResult", lane: int, i: int, low: float, high: float) -> float:
+def _longer_side(result: Any, lane: int, i: int, low: float, high: float) -> float:
     """The longer side of an interval as a relative change of the estimate."""
     p, value = result.study.unknowns[lane][i][0], float(result.value[lane, i])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -139,7 +137,7 @@ def _longer_side(result: "FitResult", lane: int, i: int, low: float, high: float
 
 
 def _grown(
-    result: "FitResult", lane: int, i: int, low: float, high: float, growth: float
+    result: Any, lane: int, i: int, low: float, high: float, growth: float
 ) -> tuple[float, float]:
     """An interval with both sides `growth` times as long on the scaled coordinate; NaN stays."""
     if growth == 1 or np.isnan(low):
@@ -157,7 +155,7 @@ def _grown(
 
 
 def limiting_bound(
-    result: "FitResult", lane: int, i: int, profiles: Intervals | None = None
+    result: Any, lane: int, i: int, profiles: Intervals | None = None
 ) -> tuple[str, float] | None:
     """The bound, set by the user, that ends the 95 % interval of an unknown on one side.
 
@@ -192,9 +190,7 @@ def limiting_bound(
     return None
 
 
-def within_bounds(
-    result: "FitResult", lane: int, i: int, low: float, high: float
-) -> tuple[float, float]:
+def within_bounds(result: Any, lane: int, i: int, low: float, high: float) -> tuple[float, float]:
     """An interval, in the parameter's unit, cut at the bounds of the fit; NaN stays.
 
     The bounds are those of the lane: an onset is looked for near its own curve.
@@ -209,7 +205,7 @@ def within_bounds(
 
 
 def _unbounded(
-    result: "FitResult", lane: int, i: int, profiles: Intervals | None
+    result: Any, lane: int, i: int, profiles: Intervals | None
 ) -> tuple[float, float, tuple[int, int] | None]:
     """Interval and `ProfileEnd` of its sides, None if local; -inf (scale `log`: 0), inf if open."""
     local = float(result.lower[lane, i]), float(result.upper[lane, i]), None
@@ -242,7 +238,7 @@ def _end(ends: list[int]) -> int:
     return max([end for end in ends if end != ProfileEnd.FAILED] or ends)
 
 
-def _evidence(result: "FitResult", lane: int, i: int, profiles: Intervals | None) -> list:
+def _evidence(result: Any, lane: int, i: int, profiles: Intervals | None) -> list:
     """Intervals (low, high, ends) that rest on more than the local error."""
     found = []
     if result.evidence_end[lane, i, 0] >= 0:
@@ -257,7 +253,7 @@ def _evidence(result: "FitResult", lane: int, i: int, profiles: Intervals | None
     return found
 
 
-def unknown_label(result: "FitResult", lane: int, i: int) -> str:
+def unknown_label(result: Any, lane: int, i: int) -> str:
     """Name of an unknown: k_M, or onset[t03], or k_M[T01] where a lane holds several of them."""
     unknowns = result.study.unknowns[lane]
     p, specimen, trial = unknowns[i]
@@ -269,18 +265,18 @@ def unknown_label(result: "FitResult", lane: int, i: int) -> str:
     return f"{p.name}[{where}]"
 
 
-def is_own(result: "FitResult", lane: int, i: int) -> bool:
+def is_own(result: Any, lane: int, i: int) -> bool:
     """Whether an unknown belongs to its lane alone, not to all lanes of a joint fit."""
     return not (result.study.joint and result.study.unknowns[lane][i][0].scope == "shared")
 
 
-def already_reported(result: "FitResult", lanes: Sequence[int], lane: int, i: int) -> bool:
+def already_reported(result: Any, lanes: Sequence[int], lane: int, i: int) -> bool:
     """Whether an unknown that all lanes share is listed with another of `lanes`, the first good."""
     first = next((k for k in lanes if result.succeeded[k]), lanes[0])
     return not is_own(result, lane, i) and lane != first
 
 
-def estimated(result: "FitResult") -> list[tuple[int, int]]:
+def estimated(result: Any) -> list[tuple[int, int]]:
     """Lane and unknown of every estimate that is listed.
 
     What the lanes of a joint fit share is listed once, with the first lane which succeeded.
@@ -294,9 +290,7 @@ def estimated(result: "FitResult") -> list[tuple[int, int]]:
     ]
 
 
-def estimate_rows(
-    result: "FitResult", profiles: Intervals | None = None
-) -> Iterator[dict[str, object]]:
+def estimate_rows(result: Any, profiles: Intervals | None = None) -> Iterator[dict[str, object]]:
     """Estimate, standard error, interval and verdict of every unknown of `estimated`."""
     for lane, i in estimated(result):
         lane_specimen, _ = result.study.lane_name(lane)

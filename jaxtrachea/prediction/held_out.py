@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.curvesion.curves import CurvePrediction, predict_sources
 from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Taken, Weighting, takes
@@ -26,6 +25,7 @@ from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import force_and_slope
+from jaxtrachea.prediction.curves import CurvePrediction, predict_sources
 from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import CurveParameters, source_of, value_of

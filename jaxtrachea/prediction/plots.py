@@ -8,8 +8,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxtrachea.curvesion.curves import CurvePrediction
 from jaxtrachea.files.pictures import STYLE, plain, save_each
+from jaxtrachea.prediction.curves import CurvePrediction
 from jaxtrachea.prediction.held_out import Compared
 
 #: Panels of a picture, curves of a panel, and curves of the picture of all samples.

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.curvesion.curves import CurvePrediction
 from jaxtrachea.files.table import Column, Row, Table, ends
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.curve import BadCurve
 from jaxtrachea.measurements.usage_tables import bad_table
+from jaxtrachea.prediction.curves import CurvePrediction
 from jaxtrachea.prediction.held_out import Compared
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.tables import band_rows

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaxtrachea.curvesion.curves import CurvePrediction
 from jaxtrachea.measurements.read import BadCurve
 from jaxtrachea.measurements.vectors import tilt_of
+from jaxtrachea.prediction.curves import CurvePrediction
 from jaxtrachea.prediction.held_out import Compared
 from jaxtrachea.status import PredictionStatus, PressStatus
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import synthetic
 from hardening import TWO, pairs, stored_again, total_study
-from jaxtrachea.curvesion.curves import predict_sources
 from noisy_fits import DEPTHS, NOISE, UNSEEN, noisy_study, true_force
 from scipy.stats import t as student
 
@@ -21,6 +20,7 @@ from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction.curves import predict_sources
 from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import source_of

@@ -9,7 +9,6 @@ import beam_fem
 import numpy as np
 import pytest
 from hardening import TWO, pairs, stored_again, total_study
-from jaxtrachea.curvesion.curves import predict_sources
 from late import late
 from noisy_fits import DEPTHS, LANES, TRUTH, true_force
 from scipy.stats import t as student
@@ -30,6 +29,7 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction.curves import predict_sources
 from jaxtrachea.prediction.sources import CurveParameters, source_of
 from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.results.hdf5 import write_hdf5
