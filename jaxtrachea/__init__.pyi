@@ -1,13 +1,12 @@
 """The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
 
+from .fitting.build import build_study as build_study
 from .fitting.fit import fit as fit
 from .fitting.lanes import Noise as Noise
 from .fitting.lanes import Weighting as Weighting
 from .fitting.result import FitResult as FitResult
 from .fitting.settings import Settings as Settings
 from .fitting.study import Study as Study
-from .fitting.study import build_study as build_study
-from .fusion import fuse as fuse
 from .inference.bootstrap import bootstrap as bootstrap
 from .inference.online import Online as Online
 from .inference.profile import profiles as profiles
@@ -18,8 +17,6 @@ from .measurements.read import read_measurements as read_measurements
 from .mechanics.beam import Beam as Beam
 from .mechanics.beam import contact_compliance as contact_compliance
 from .mechanics.beam import deflect as deflect
-from .mechanics.bound import BoundPress as BoundPress
-from .mechanics.bound import bind as bind
 from .mechanics.force_law import Law as Law
 from .mechanics.force_law import duffing as duffing
 from .mechanics.friction import Coulomb as Coulomb
@@ -39,7 +36,7 @@ from .mechanics.press_in_time import press_in_time as press_in_time
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
 from .notebook import load_ipython_extension as load_ipython_extension
-from .prediction.predict import CurvePrediction as CurvePrediction
+from .prediction.curves import CurvePrediction as CurvePrediction
 from .prediction.predict import predict as predict
 from .relaxation.filter import Relaxation as Relaxation
 from .relaxation.steps import Branches as Branches

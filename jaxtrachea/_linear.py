@@ -5,7 +5,6 @@ known in a better form they are given together: rules for derivatives stay rules
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 
 import jax
@@ -15,9 +14,6 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-#: Numbers that a lane takes and gives from which on lanes are taken in turn on a CPU: together they
-#: would be in fresh memory at every call, and out of the cache.
-LARGE = 2048
 #: From what is fixed and what it is linear in, to results; lists of arrays.
 Linear = Callable[[Sequence, Sequence], Sequence[Array]]
 
@@ -128,40 +124,18 @@ def _lanes(operands, axes, *, way, pull, shown):
     ]
     of_lane = [i for i, a in enumerate(axes[: way.split]) if a is not None]
 
-    def over(f: Linear, like: Sequence) -> Linear:
+    def over(f: Linear) -> Linear:
         def many(fixed, tangents):
-            def one(lane):
-                return list(f(replaced(fixed, of_lane, lane[0]), lane[1]))
+            def one(own, tangents):
+                return list(f(replaced(fixed, of_lane, own), tangents))
 
-            return over_lanes(one, one, ([fixed[i] for i in of_lane], list(tangents)), count, like)
+            return jax.vmap(one)([fixed[i] for i in of_lane], list(tangents))
 
         return many
 
     like = [ShapedArray((count, *v.shape), v.dtype) for v in shown]
-    ways = over(way.push, shown), over(pull, way.given[way.split :])
-    out = linear(*ways, fixed, tangents, like)
+    out = linear(over(way.push), over(pull), fixed, tangents, like)
     return out, [0] * len(out)
-
-
-def over_lanes(one: Callable, of_many: Callable, lanes, count: int, like: Sequence):
-    """A function of every lane; on a CPU in turn where the arrays of a lane are large (`LARGE`).
-
-    Args:
-        one: of one lane, by itself or in its turn.
-        of_many: the same, for all lanes together.
-        lanes: tree of arrays with the lanes in front.
-        count: of lanes.
-        like: arrays of the shapes of what `one` gives.
-    """
-    if count == 1:
-        found = one(jax.tree.map(lambda v: v[0], lanes))
-        return jax.tree.map(lambda v: v[None], found)
-    taken = sum(v.size for v in jax.tree.leaves(lanes)) // max(count, 1)
-    if taken + sum(math.prod(v.shape) for v in like) < LARGE:
-        return jax.vmap(of_many)(lanes)
-    return jax.lax.platform_dependent(
-        lanes, cpu=lambda v: jax.lax.map(one, v), default=jax.vmap(of_many)
-    )
 
 
 _linear_p = Primitive("linear")

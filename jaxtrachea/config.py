@@ -52,7 +52,7 @@ def quantity(dimension: str, *, positive: bool = False, words: tuple[str, ...] =
 
 
 def _number_or_quantity(value: Any) -> Any:
-    """Checked against the parameter's unit later, in `fitting.study`."""
+    """Checked against the parameter's unit later, in `fitting.build`."""
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise ValueError("expected a number, or a quantity with its unit")
     if isinstance(value, int) and abs(value) > 1e300:

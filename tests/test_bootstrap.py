@@ -12,10 +12,10 @@ import pytest
 import synthetic
 from run_cli import GOOD, run
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.bootstrap import Bootstrap, bootstrap, enlargement
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.influence import influence

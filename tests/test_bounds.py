@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import synthetic
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import bootstrap as bootstraps
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt

@@ -15,6 +15,7 @@ import synthetic
 from small_scenes import MATERIAL, MESH, TUBE, presses
 
 from jaxtrachea import EffectOptions, make_scene, simulate
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
@@ -22,7 +23,6 @@ from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import bootstrap
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import influence

@@ -19,13 +19,13 @@ from jaxtrachea.cli.fit import describe
 from jaxtrachea.cli.load import load
 from jaxtrachea.cli.options import FitOptions
 from jaxtrachea.cli.terminal import Stop
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.criteria import penalised
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.onset import where_sought
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import cross_validation
 from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence, weights
 from jaxtrachea.inference.cross_validation import leave_one_out, without

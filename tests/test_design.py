@@ -12,10 +12,10 @@ from run_cli import run, tree
 
 from jaxtrachea.cli.run import refuse
 from jaxtrachea.config import FitSpec, SpecError, load_fit_spec
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import left_out
 from jaxtrachea.inference.analysis import Request
 from jaxtrachea.inference.design.candidates import (

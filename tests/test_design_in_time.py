@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from jaxtrachea.config import FitSpec, SpecError
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.design import Design, candidate_rows, choice_rows, draw_design
 from jaxtrachea.inference.design.candidates import candidates_of, grid
 from jaxtrachea.inference.design.choice import gains, next_points

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from compilations import compilations
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.lanes import Noise
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

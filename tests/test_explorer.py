@@ -11,10 +11,10 @@ import pytest
 from jaxtrachea.cli.specification import settings_of, study_of, usable
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files.html import page
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.measurements.read import Curve

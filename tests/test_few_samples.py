@@ -10,12 +10,12 @@ import synthetic
 from scipy.optimize import least_squares
 
 from jaxtrachea.fitting import few_samples, minima
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.few_samples import same_ends, serves
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus

@@ -8,13 +8,13 @@ import pytest
 import synthetic
 from scipy.optimize import brentq, least_squares
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.weakest_direction import describe_weakest
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.press import press

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import synthetic
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
 

@@ -16,12 +16,12 @@ from matplotlib.legend import Legend
 from matplotlib.text import Text
 
 import jaxtrachea
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.fitted_errors import fitted_errors
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, draw_left_out
 from jaxtrachea.inference.analyses.profile import draw_profiles
 from jaxtrachea.inference.cross_validation import leave_one_out

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.evaluate import evaluated
 from jaxtrachea.fitting.force_share import (
     Levels,
@@ -14,7 +15,6 @@ from jaxtrachea.fitting.force_share import (
     with_levels,
 )
 from jaxtrachea.fitting.lanes import Noise
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import synthetic
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve

@@ -13,12 +13,12 @@ from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
 from jaxtrachea.cli import specification
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.information import fixed_count, unknown_count
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference.analyses.population import POPULATION, population_rows
 from jaxtrachea.inference.analysis import AnalysisResults

@@ -6,9 +6,9 @@ import maxwell
 import numpy as np
 import pytest
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.comparison import Model, compared, sentence
 from jaxtrachea.inference.repeats import leave_repeats_out, repeats
 from jaxtrachea.measurements.curve import Curve

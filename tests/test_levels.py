@@ -14,10 +14,10 @@ import pytest
 import jaxtrachea
 from jaxtrachea.config import ModelSection
 from jaxtrachea.fitting import forward_residual
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DECLARED, DEFAULTS, in_model
 from jaxtrachea.fitting.residual import of_press, of_trials, residual
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.levels.choose import LEVELS, level_of
 from jaxtrachea.mechanics.levels.level import Level, Motion, Response, Size

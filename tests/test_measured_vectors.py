@@ -11,7 +11,7 @@ import pytest
 from run_cli import run
 
 from jaxtrachea.cli.main import _curve_table
-from jaxtrachea.fitting.study import build_study
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.measurements.read import (
     Curve,
     DataError,

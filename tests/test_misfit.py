@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from late import late
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.misfit import MISFIT
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

@@ -9,10 +9,10 @@ import synthetic
 from late import late
 from run_cli import run
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.prediction.predict import predict
 

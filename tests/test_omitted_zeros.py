@@ -9,10 +9,10 @@ from run_cli import run
 from scipy.signal import lfilter
 
 from jaxtrachea.fitting import omitted_zeros
+from jaxtrachea.fitting.assessment import assess
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit, with_omitted_zeros
-from jaxtrachea.fitting.result import assess
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.fitting.zero_messages import sentences_of_fits
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options

@@ -10,7 +10,7 @@ import synthetic
 from scipy.optimize import least_squares
 
 import jaxtrachea as jt
-from jaxtrachea.fitting.result import assess
+from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.inference.design.candidates import Candidates
 from jaxtrachea.inference.design.choice import next_points
 from jaxtrachea.inference.design.situation import situation

@@ -11,11 +11,11 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 
 from jaxtrachea._numerics import centred_hinge
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out, without
 from jaxtrachea.inference.design.candidates import Candidates, check

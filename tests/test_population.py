@@ -8,10 +8,10 @@ from late import late
 from scipy.optimize import minimize
 from scipy.stats import chi2, multivariate_normal, t
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.population import POPULATION
 from jaxtrachea.inference.population import population
 from jaxtrachea.inference.random_effects import Common, random_effects

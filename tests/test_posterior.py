@@ -14,11 +14,11 @@ import pytest
 from run_cli import GOOD, run
 
 from jaxtrachea.cli.run import poor
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analyses.posterior import POSTERIOR, posterior_table
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.estimate import lane_of

@@ -15,13 +15,13 @@ from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
 from jaxtrachea.files.table import Column, Interval
+from jaxtrachea.fitting.assessment import assess, limiting_bound
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.profile_search import Sides
-from jaxtrachea.fitting.result import assess, limiting_bound
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.profile import profile_rows
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.inference.profile import choose, profiles

@@ -8,11 +8,11 @@ import pytest
 import scipy.optimize
 from jitted import jitted
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import structure
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, blend, coefficient, fold_depth

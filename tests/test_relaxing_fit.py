@@ -11,13 +11,13 @@ from late import late
 
 from jaxtrachea.fitting import forward_residual
 from jaxtrachea.fitting.branch_times import unsampled_time
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.few_samples import serves
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.refusals import mixed_in_time
 from jaxtrachea.fitting.residual import of_press, of_trials, residual, residual_value
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.mechanics.levels.options import Options

@@ -6,9 +6,9 @@ Records are closed forms of a ramp of T and a hold, one branch beside a spring.
 import numpy as np
 import pytest
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.trachea.geometry import table_1

@@ -21,14 +21,14 @@ from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
 from jaxtrachea.files.table import Table, quoted, unquoted, words
+from jaxtrachea.fitting.assessment import assess, unknown_label
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.effective import share_independent
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
-from jaxtrachea.fitting.result import assess, unknown_label, verdict_of
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import widened
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, left_out_table
 from jaxtrachea.inference.analyses.influence import (
@@ -261,7 +261,7 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
     for row in rows:
         k = labels.index(f"k_3[{row['specimen']}]")
         assert row["k_3 [N/mm^3]"] == dense.value[0, k]
-        assert row["k_3 verdict"] == verdict_of(dense, 0, k)
+        assert row["k_3 verdict"] == assess(dense, 0, k).verdict
         assert row["k_1 [N/mm]"] == dense.value[0, 0]
         assert row["k_1 low95"] == assess(dense, 0, 0).low <= dense.lower[0, 0]
     assert rows[0]["more"] == "force_offset[A/1], force_offset[A/2]: see parameters.csv"
@@ -375,7 +375,7 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     low, high = ends_of(result)
     assert low[0].tolist() == [p.lower for p in result.study.free]
     assert high[0].tolist() == [p.upper for p in result.study.free]
-    words = {verdict_of(result, 0, i) for i in range(2)}
+    words = {assess(result, 0, i).verdict for i in range(2)}
     assert words == {"inconclusive: the model misses the curve"}
     rows = list(parameter_rows(widened(result)))
     assert np.isnan([[row["se"], row["relative_se"]] for row in rows]).all()

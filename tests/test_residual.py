@@ -11,11 +11,11 @@ import synthetic
 from scipy.integrate import quad
 
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.residual import residual, residual_value
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.material import Material

@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
 from jaxtrachea.files.table import Column, Interval, Table, number, words
+from jaxtrachea.fitting.assessment import unknown_label
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.effective import lag_correlation
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
-from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import left_out_table
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analysis import AnalysisResults

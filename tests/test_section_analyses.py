@@ -13,11 +13,11 @@ from run_cli import run
 from scipy.optimize import least_squares
 
 from jaxtrachea.config import DesignSection, FitSpec, SpecError
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lane import size
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import influence as analysis
 from jaxtrachea.inference.design.candidates import Candidates, candidates_of
 from jaxtrachea.inference.design.choice import next_points

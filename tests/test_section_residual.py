@@ -12,6 +12,7 @@ import pytest
 from jaxtrachea.cli.specification import options_of, parameters_of
 from jaxtrachea.config import SpecError, load_fit_spec
 from jaxtrachea.fitting import information, shared, structure
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.effective import effective_samples
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.information import Information
@@ -29,7 +30,6 @@ from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.refusals import Size, check_curve
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.comparison import same_data
 from jaxtrachea.inference.posterior import posterior

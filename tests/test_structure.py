@@ -6,9 +6,9 @@ import beam_fem
 import numpy as np
 import pytest
 
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.structure import null_spaces, pins, structure, suspicious
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1

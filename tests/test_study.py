@@ -15,9 +15,9 @@ from run_cli import run
 from jaxtrachea._errors import InputError
 from jaxtrachea.cli.specification import parameters_of, study_of, usable
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.design.candidates import candidates_of
 from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5

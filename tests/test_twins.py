@@ -10,10 +10,10 @@ from run_cli import run
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import load_fit_spec
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.holdout_groups import companions, holdout_sentence, with_holdout_groups
 from jaxtrachea.inference.repeats import leave_repeats_out, repeats

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxtrachea.config import FitSpec
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.parameters import defaults_of, in_model
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import Wall

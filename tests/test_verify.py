@@ -13,12 +13,12 @@ from specimens import NAMES, POSITIONS, STIFF_CONTACT
 from jaxtrachea.files.table import Table
 from jaxtrachea.fitting import structure as structures
 from jaxtrachea.fitting import verify
+from jaxtrachea.fitting.assessment import assess
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.predictions import Prediction
-from jaxtrachea.fitting.result import assess, verdict_of
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
@@ -231,7 +231,7 @@ def test_an_end_that_was_not_found_is_no_proof(result):
         changed = dataclasses.replace(
             result, evidence_end=end, evidence_low=low, evidence_high=high
         )
-        words.append(verdict_of(changed, 4, 2))
+        words.append(assess(changed, 4, 2).verdict)
         high[4, 2] = result.value[4, 2]
     assert words == ["identifiable", "inconclusive"]
     # Where nothing is known of a side, the local error: no interval of no width.
@@ -251,7 +251,7 @@ def test_no_doubt_costs_nothing(study, monkeypatch):
     usual = fit(clear)
     np.testing.assert_array_equal(usual.theta, plain.theta)
     assert (usual.evidence_end == -1).all()
-    assert [verdict_of(usual, 0, i) for i in range(4)] == ["identifiable"] * 4
+    assert [assess(usual, 0, i).verdict for i in range(4)] == ["identifiable"] * 4
 
 
 @pytest.mark.slow

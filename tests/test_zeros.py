@@ -10,10 +10,10 @@ from records import compliance, recorded
 from jaxtrachea._errors import InputError
 from jaxtrachea.cli.specification import parameters_of, usable
 from jaxtrachea.config import FitSpec, SpecError
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import structure
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.fitting.zero_messages import cells, sentences
 from jaxtrachea.inference.design.press import index_of_presses, of_a_new_press
 from jaxtrachea.measurements.read import Curve, Measurements

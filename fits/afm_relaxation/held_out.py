@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.config import load_fit_spec
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.mechanics.levels.choose import level_of

@@ -94,8 +94,8 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.table import Table
     from jaxtrachea.prediction import report, tables
+    from jaxtrachea.prediction.curves import predict_sources
     from jaxtrachea.prediction.plots import draw_predictions
-    from jaxtrachea.prediction.predict import predict_sources
 
     sources, s, depths, aside, times = _asked(stored, texts)
     with into(out_dir, default) as (folder, stop_if_asked):

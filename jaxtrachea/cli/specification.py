@@ -5,11 +5,12 @@ from collections.abc import Mapping
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held, in_model, visible
 from jaxtrachea.fitting.refusals import Refusal, Size, as_read, refusal
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Study, build_study
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.zeros import without_line, zeros_of
 from jaxtrachea.inference.holdout_groups import with_holdout_groups
 from jaxtrachea.measurements.read import (

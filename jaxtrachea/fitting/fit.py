@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtrachea.fitting.build import with_zeros
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.evaluate import evaluated
@@ -30,9 +31,9 @@ from jaxtrachea.fitting.omitted_zeros import asked_for, merged, near_estimates
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
-from jaxtrachea.fitting.starts import scales
+from jaxtrachea.fitting.starts import scales, unscaled
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
-from jaxtrachea.fitting.study import Study, with_zeros
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verify import verify_minimum
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
@@ -67,7 +68,7 @@ def fit(
     keeps what was found, and refits from it do, too. Each stage is logged (`logging`, level INFO).
 
     Args:
-        study: from `study.build_study`.
+        study: from `build.build_study`.
         settings: how to solve.
         progress: called with (starts finished since the last call, starts in all).
         starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.
@@ -239,7 +240,6 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     lanes, theta = study.lanes, solved.theta
     alive = solved.status <= FitStatus.STALLED
     gradient = summed_gradient(study, info, alive) if study.joint else info.gradient
-    log, step = scales(study)
     at_bound = (theta <= lanes.lower) & (gradient > 0)
     at_bound |= (theta >= lanes.upper) & (gradient < 0)
     present = lanes.active > 0
@@ -257,15 +257,14 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         structural=open_,
     )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-
-        def unscale(v):
-            return np.where(present, np.where(log, np.exp(v), v * step), np.nan)
-
-        value = unscale(theta)
-        half = u.half_width[:, None] * u.se
         rms = np.sqrt(info.plain / info.counts)
+        half = u.half_width[:, None] * u.se
+        value, lower, upper = (
+            np.where(present, unscaled(study, v), np.nan)
+            for v in (theta, theta - half, theta + half)
+        )
+        log, step = scales(study)
         standard_error = u.se * np.where(log, value, step)
-        lower, upper = unscale(theta - half), unscale(theta + half)
     unit = precision_unit(study)
     samples = np.sum(info.counts, axis=1)
     left = np.sum(pool.counts, axis=1) - (np.sum(~held, axis=1) if unknowns is None else unknowns)

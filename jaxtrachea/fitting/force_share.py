@@ -137,8 +137,7 @@ def offsets(study: Study, theta: Float[np.ndarray, "lanes P"]) -> Float[np.ndarr
         return np.full(study.lanes.s_c.shape, p.value)
     index = np.asarray(study.lanes.index)[:, :, column]
     scaled = np.take_along_axis(theta, np.maximum(index, 0), axis=1)
-    value = np.exp(scaled) if p.scale == "log" else scaled * p.step
-    return np.where(index >= 0, value, p.value)
+    return np.where(index >= 0, p.from_scaled(scaled), p.value)
 
 
 def _most_likely(r, F, p, sigma_given: bool, share: float | None) -> tuple[float, float]:

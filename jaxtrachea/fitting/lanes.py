@@ -249,7 +249,7 @@ def lanes_of(
         geometry: the tube.
         noise: known standard deviations.
         weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
-        tool_radius: see `study.build_study`.
+        tool_radius: see `build.build_study`.
         level: of the model: whether it reads what is below `Lane.phi_c`, and the time.
     """
     vectors = level.off_midline

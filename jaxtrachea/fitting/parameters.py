@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -110,9 +111,10 @@ class Parameter:
         """Coordinate of a value: log(value) or value / step."""
         return math.log(value) if self.scale == "log" else value / self.step
 
-    def from_scaled(self, theta: float) -> float:
-        """Value at a coordinate."""
-        return math.exp(theta) if self.scale == "log" else theta * self.step
+    def from_scaled(self, theta: Any) -> Any:
+        """Value at a coordinate, of a number or of an array of any shape."""
+        with np.errstate(over="ignore"):
+            return np.exp(theta) if self.scale == "log" else theta * self.step
 
 
 def held(p: Parameter) -> Parameter:

@@ -6,7 +6,7 @@ on the lanes beside it.
 
 import hashlib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -169,3 +169,10 @@ def scales(study: Study) -> tuple[np.ndarray, np.ndarray]:
     """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
     log = study.of_unknowns(lambda p: p.scale == "log", False)
     return log, study.of_unknowns(lambda p: p.step, 1.0)
+
+
+def unscaled(study: Study, theta: np.ndarray, at: Any = ...) -> np.ndarray:
+    """`Parameter.from_scaled` of coordinates of the unknowns `at`, an index of (lanes, P)."""
+    log, step = (v[at] for v in scales(study))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.where(log, np.exp(theta), theta * step)

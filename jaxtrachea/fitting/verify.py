@@ -21,7 +21,7 @@ from jaxtrachea.fitting.other_starts import soft_starts, twins
 from jaxtrachea.fitting.profile_search import Sides, find_ends
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.starts import EXACT, scales
+from jaxtrachea.fitting.starts import EXACT, unscaled
 from jaxtrachea.fitting.structure import Structure
 from jaxtrachea.status import FitStatus, ProfileEnd
 
@@ -221,14 +221,9 @@ def _profiled(region: _Region, evidence: Evidence) -> None:
     )
     open_ = end == ProfileEnd.OPEN
     low, high = np.where(open_[:, 0], -np.inf, low), np.where(open_[:, 1], np.inf, high)
-    log, step = scales(result.study)
-    with np.errstate(over="ignore"):
-
-        def unscale(v):
-            return np.where(log[lane, unknown], np.exp(v), v * step[lane, unknown])
-
-        evidence.evidence_low[lane, unknown] = unscale(low)
-        evidence.evidence_high[lane, unknown] = unscale(high)
+    at = lane, unknown
+    evidence.evidence_low[at] = unscaled(result.study, low, at)
+    evidence.evidence_high[at] = unscaled(result.study, high, at)
     evidence.evidence_end[lane, unknown] = end
 
 

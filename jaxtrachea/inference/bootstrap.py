@@ -230,7 +230,7 @@ def _summary(result: FitResult, theta, usable) -> tuple[np.ndarray, np.ndarray, 
         ends = np.quantile(good, [0.025, 0.975], axis=0)
         spread = np.std(good, axis=0, ddof=1)
         for i, (p, _, _) in enumerate(unknowns):
-            lower[lane, i], upper[lane, i] = (p.from_scaled(float(v)) for v in ends[:, i])
+            lower[lane, i], upper[lane, i] = p.from_scaled(ends[:, i])
             slope = result.value[lane, i] if p.scale == "log" else p.step
             error[lane, i] = spread[i] * slope
     return lower, upper, error

@@ -55,6 +55,5 @@ def quantiles(
     out = np.full((3, theta.shape[-1]), np.nan)
     for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
         if np.isfinite(theta[..., i]).all():
-            ends = np.quantile(theta[..., i], [0.5, 0.025, 0.975])
-            out[:, i] = [p.from_scaled(float(v)) for v in ends]
+            out[:, i] = p.from_scaled(np.quantile(theta[..., i], [0.5, 0.025, 0.975]))
     return out

@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.fitting.study import Study, with_recipe
+from jaxtrachea.fitting.build import with_recipe
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.read import BadCurve, Curve
 
 #: Trials that a message names.

@@ -4,16 +4,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from jaxtrachea.fitting.assessment import DETERMINED, assess, limiting_bound, unknown_label
 from jaxtrachea.fitting.branch_times import unsampled_time
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.press_scale import sizes_of_press
-from jaxtrachea.fitting.result import (
-    DETERMINED,
-    FitResult,
-    limiting_bound,
-    unknown_label,
-    verdict_of,
-)
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.verdict import VERDICTS
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.weakest_direction import (
@@ -66,7 +61,7 @@ def outcome(result: FitResult, profiles: Profiles | None = None) -> str:
 
 def determined_unknowns(result: FitResult, lane: int, profiles: Profiles | None = None) -> int:
     """Unknowns of a lane that are identifiable or weak."""
-    words = (verdict_of(result, lane, i, profiles) for i in range(_count(result, lane)))
+    words = (assess(result, lane, i, profiles).verdict for i in range(_count(result, lane)))
     return sum(word in DETERMINED for word in words)
 
 
@@ -153,7 +148,7 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
         return NOTHING_FITTED
     groups: dict[str, list[str]] = {}
     for i in range(len(result.study.unknowns[lane])):
-        word = verdict_of(result, lane, i, profiles)
+        word = assess(result, lane, i, profiles).verdict
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
     said = [_listed(word, groups[word]) for word in VERDICTS if word in groups]
     said += _limited(result, lane, profiles)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
+from jaxtrachea.fitting.build import Table
 from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.effective import Effective, effective
 from jaxtrachea.fitting.fit import final_status
@@ -25,7 +26,7 @@ from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.refusals import Size, check_curve, refusal
 from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.fitting.starts import scales
-from jaxtrachea.fitting.study import Study, Table
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verdict import verdict
 from jaxtrachea.fitting.zeros import resolved
 from jaxtrachea.inference.design.choice import Criterion, gains, scores_after

@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.fitting.build import Table, build_study
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.stream import BLOCK
-from jaxtrachea.fitting.study import Study, Table, build_study
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.design.candidates import Candidates
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.levels.choose import level_of

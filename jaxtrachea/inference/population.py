@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea.fitting.assessment import DETERMINED, Intervals, assess
 from jaxtrachea.fitting.parameters import Parameter
-from jaxtrachea.fitting.result import DETERMINED, FitResult, Intervals, assess
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verdict import WEAK
 from jaxtrachea.inference.profile import Profiles
@@ -72,7 +73,7 @@ class Population:
             return {}
         j = int(found[0])
         p = self.parameters[j]
-        value = p.from_scaled(float(self.effects.shrunk[lane, j]))
+        value = p.from_scaled(self.effects.shrunk[lane, j])
         slope = value if p.scale == "log" else p.step
         return {"shrunk": value, "shrunk_se": slope * float(self.effects.shrunk_sd[lane, j])}
 

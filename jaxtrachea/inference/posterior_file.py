@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
-from jaxtrachea.fitting.result import unknown_label
+from jaxtrachea.fitting.assessment import unknown_label
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.posterior import Posterior
 
@@ -29,9 +29,9 @@ def write_posterior(posterior: Posterior, path: Path) -> None:
     units: dict[str, str] = {}
     for lane, unknowns in enumerate(result.study.unknowns):
         for i, (p, _, _) in enumerate(unknowns):
-            name, theta = unknown_label(result, lane, i), posterior.theta[lane, ..., i]
+            name = unknown_label(result, lane, i)
             values = draws.setdefault(name, np.full(shape, np.nan))
-            values[lane] = np.exp(theta) if p.scale == "log" else theta * p.step
+            values[lane] = p.from_scaled(posterior.theta[lane, ..., i])
             units[name] = p.unit
     names = [lane_label(result, lane) for lane in range(result.lanes)]
     with hdf5_file(path) as file:

@@ -19,6 +19,7 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.profile_search import Sides, find_ends, on_grid
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
+from jaxtrachea.fitting.starts import unscaled
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 
@@ -135,15 +136,9 @@ def profiles(
     best = np.take_along_axis(result.theta[lane], unknown[:, None], axis=1)[:, 0]
     reach = np.where(end == ProfileEnd.OPEN, np.inf, distance)
     reach = np.where(end == ProfileEnd.FAILED, np.nan, reach).reshape(-1, 2)
-    parameters = [result.study.unknowns[k][i][0] for k, i in zip(lane, unknown, strict=True)]
-    log = np.array([p.scale == "log" for p in parameters], bool)
-    step = np.array([p.step for p in parameters])
-    with np.errstate(over="ignore"):
-
-        def unscale(v):
-            return np.where(log, np.exp(v), v * step)
-
-        lower, upper = unscale(best - reach[:, 0]), unscale(best + reach[:, 1])
+    lower, upper = (
+        unscaled(result.study, v, (lane, unknown)) for v in (best - reach[:, 0], best + reach[:, 1])
+    )
     threshold = sides.target[::2] ** 2
     ends = end.reshape(-1, 2)
     return Profiles(result, lane, unknown, lower, upper, ends, threshold, theta, statistic)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Taken, Weighting, takes
 from jaxtrachea.fitting.model import columns_of
@@ -17,15 +18,15 @@ from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Study, build_study
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.zeros import resolved
 from jaxtrachea.measurements.observed import WITHOUT_VECTORS
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import force_and_slope
+from jaxtrachea.prediction.curves import CurvePrediction, predict_sources
 from jaxtrachea.prediction.model_error import model_errors
-from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import CurveParameters, source_of, value_of
 from jaxtrachea.status import FitStatus, PredictionStatus

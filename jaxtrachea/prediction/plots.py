@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxtrachea.files.pictures import STYLE, plain, save_each
+from jaxtrachea.prediction.curves import CurvePrediction
 from jaxtrachea.prediction.held_out import Compared
-from jaxtrachea.prediction.predict import CurvePrediction
 
 #: Panels of a picture, curves of a panel, and curves of the picture of all samples.
 PANELS, LINES, MAX_CURVES = 12, 10, 200

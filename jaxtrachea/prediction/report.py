@@ -8,8 +8,8 @@ from jaxtrachea.files.table import Column, Row, Table, ends
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.curve import BadCurve
 from jaxtrachea.measurements.usage_tables import bad_table
+from jaxtrachea.prediction.curves import CurvePrediction
 from jaxtrachea.prediction.held_out import Compared
-from jaxtrachea.prediction.predict import CurvePrediction
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.tables import band_rows
 from jaxtrachea.status import PredictionStatus

@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxtrachea.measurements.read import BadCurve
 from jaxtrachea.measurements.vectors import tilt_of
+from jaxtrachea.prediction.curves import CurvePrediction
 from jaxtrachea.prediction.held_out import Compared
-from jaxtrachea.prediction.predict import CurvePrediction
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 Row = dict[str, object]

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_hex
 
-from jaxtrachea.fitting.result import FitResult, unknown_label
+from jaxtrachea.fitting.assessment import unknown_label
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analyses.influence import influence_cell
 from jaxtrachea.inference.influence import Influence
 from jaxtrachea.inference.labels import lane_label, succeeded

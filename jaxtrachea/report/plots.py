@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxtrachea.files.pictures import STYLE, of_all, plain, save_each
-from jaxtrachea.fitting.result import FitResult, unknown_label
+from jaxtrachea.fitting.assessment import unknown_label
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first

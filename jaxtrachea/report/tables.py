@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.files.table import Column, Interval, Table
-from jaxtrachea.fitting.parameters import OF_THE_PRESS
-from jaxtrachea.fitting.result import (
+from jaxtrachea.fitting.assessment import (
     DETERMINED,
-    FitResult,
     already_reported,
     assess,
     is_own,
     unknown_label,
 )
+from jaxtrachea.fitting.parameters import OF_THE_PRESS
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.labels import lane_label, peak_force, succeeded
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.rows import and_more

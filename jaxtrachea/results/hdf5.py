@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.files.table import Table
-from jaxtrachea.fitting.result import FitResult, assess
+from jaxtrachea.fitting.assessment import assess
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.results import store

@@ -4,14 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from jaxtrachea.fitting.assessment import assess, estimate_rows, estimated, unknown_label
 from jaxtrachea.fitting.predictions import Prediction
-from jaxtrachea.fitting.result import (
-    FitResult,
-    assess,
-    estimate_rows,
-    estimated,
-    unknown_label,
-)
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import NOTHING_FITTED
 from jaxtrachea.inference.profile import Profiles

@@ -11,7 +11,6 @@ from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
-from jaxtrachea.fusion import map_sequentially
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.mechanics.validation import has_solution
 from jaxtrachea.scene import trail
@@ -68,15 +67,8 @@ def deform(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach
 
     moved = moved._replace(dissipated=None, status=None)
     led = path if slides and made is not None else None
-    if presses.s.shape[0] == 1:
-        # No lanes of the weights: of many such paths together they would be in memory for all.
-        where = where if together else jax.tree.map(lambda v: v[0], where)
-        moved, led = jax.tree.map(lambda v: v[0], (moved, led))
-        return map_sequentially(one)(moved, where, led, None)[None]
     share = regions.weigh(binding, where[1]) if together else None
-    return jax.vmap(map_sequentially(one), (0, None if together else 0, 0, None))(
-        moved, where, led, share
-    )
+    return jax.vmap(one, (0, None if together else 0, 0, None))(moved, where, led, share)
 
 
 def _held_at(scene: Scene, s_c):

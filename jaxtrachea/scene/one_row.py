@@ -1,7 +1,7 @@
 """A program of one row that is called many times: numbers go in and out as few arrays.
 
-All but the surface is one kernel (`fusion`); what there is for every ring or vertex is written
-where an earlier call wrote it, if nobody holds that any more.
+What there is for every ring or vertex is written where an earlier call wrote it, if nobody holds
+that any more.
 """
 
 import copy
@@ -16,7 +16,6 @@ import numpy as np
 from jax import Array
 
 from jaxtrachea._packed import Packing
-from jaxtrachea.fusion import fuse
 from jaxtrachea.scene.simulation import Simulation, surface
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.scene.together import deform_together
@@ -67,16 +66,11 @@ class Row:
 
     def run(self, state, *given):
         """The next state, the contact as one array, and `large` (traced)."""
-
-        def line(*given):
-            # State and contact as two arrays: in one, much of what both need is computed twice.
-            state, contact, large, press = self._one(*given)
-            return state, self.contacts.pack(contact), tuple(large.values()), press
-
-        state, contact, large, press = fuse(line)(state, *given)
+        state, contact, large, press = self._one(state, *given)
         lay = deform_together if self._scene.instruments else surface
         vertices = lay(self._setting(*given)[0], *press) if self._shown else None
-        return state, contact, large if vertices is None else (*large, vertices[0])
+        large = (*large.values(), *([] if vertices is None else [vertices[0]]))
+        return state, self.contacts.pack(contact), large
 
     def __call__(self, state, *given) -> tuple[Array, Simulation]:
         """The next state, and the result (traced)."""
@@ -122,7 +116,7 @@ class OneRow:
         self.state = jnp.array(state)
         names = [n for n in Simulation._fields if getattr(contact, n) is not None]
         where = {name: i for i, name in enumerate([*names, *large])}
-        self.fusion = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
+        self._order = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
 
     def __call__(self, *given: Any) -> Simulation:
         """The finished result: numpy arrays, and `LARGE` on the device."""
@@ -131,7 +125,7 @@ class OneRow:
         if large:
             self._sets.append(large)
         contact = self._contacts.leaves(np.asarray(packed))  # waits for all of them
-        return Simulation._make(self.fusion((*contact, *large, None)))
+        return Simulation._make(self._order((*contact, *large, None)))
 
     def copy(self) -> "OneRow":
         """The same program with memory and state of its own."""

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._numerics import scaled
-from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import (
     ObliquePress,
@@ -168,7 +167,7 @@ def move(scene: Scene, material: Any, presses: Presses, samples: Samples | None 
     solve = vectors if scene.plan.second_plane else one_plane
     if samples is not None:
         return solve(scene, material, presses, samples)
-    return fuse(lambda presses: solve(scene, material, presses))(presses)
+    return solve(scene, material, presses)
 
 
 def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) -> Moved:

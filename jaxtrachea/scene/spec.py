@@ -5,6 +5,7 @@ the specification is opened here.
 """
 
 import dataclasses
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,7 +35,7 @@ from jaxtrachea.relaxation import laws
 from jaxtrachea.relaxation.words import Word
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.trachea.material import DEEP, OF_TIME, VALUES, meaningless
+from jaxtrachea.trachea.material import DEEP, OF_TIME, VALUES, Declaration, meaningless
 
 Lengths3 = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Sizes3 = Annotated[list[PositiveLength], Field(min_length=3, max_length=3)]
@@ -100,16 +101,16 @@ class SceneTracheaSection(Section):
         return self
 
 
-def _material_keys() -> type[Section]:
-    """A key for each value that `trachea.material` declares."""
+def _keys(declared: Mapping[str, Declaration], needed: Collection[str] = ()) -> type[Section]:
+    """A key for each value that is declared; all but those `needed` may be left out."""
     keys: dict[str, Any] = {}
-    for name, p in VALUES.items():
+    for name, p in declared.items():
         number: Any = Annotated[float, quantity(p.dimension, positive=not p.signed)]
-        keys[name] = (number | None, None) if p.absent else (number, ...)
-    return create_model("MaterialKeys", __base__=Section, **keys)
+        keys[name] = (number, ...) if name in needed else (number | None, None)
+    return create_model("Keys", __base__=Section, **keys)
 
 
-class MaterialSection(_material_keys()):
+class MaterialSection(_keys(VALUES, [name for name, p in VALUES.items() if not p.absent])):
     """[material]: see `jaxtrachea.trachea.material`; one value for all rings and spans."""
 
     @model_validator(mode="after")
@@ -123,16 +124,7 @@ class MaterialSection(_material_keys()):
         return self
 
 
-def _section_keys() -> type[Section]:
-    """A key for each value that `SectionMaterial` declares; a wall may give what is left out."""
-    keys: dict[str, Any] = {}
-    for name, p in SECTION_VALUES.items():
-        number: Any = Annotated[float, quantity(p.dimension, positive=not p.signed)]
-        keys[name] = (number | None, None)
-    return create_model("SectionKeys", __base__=Section, **keys)
-
-
-class SectionsSection(_section_keys()):
+class SectionsSection(_keys(SECTION_VALUES)):
     """[sections]: see `SectionMaterial`; one value for all rings and spans."""
 
     @model_validator(mode="after")
@@ -152,16 +144,7 @@ class SceneWallSection(WallSection):
     """of the tool's flat end; the local contact follows it"""
 
 
-def _relaxation_keys() -> type[Section]:
-    """A key for each number of a law of relaxation."""
-    keys: dict[str, Any] = {}
-    for name, p in OF_TIME.items():
-        number: Any = Annotated[float, quantity(p.dimension, positive=True)]
-        keys[name] = (number | None, None)
-    return create_model("RelaxationKeys", __base__=Section, **keys)
-
-
-class RelaxationSection(_relaxation_keys()):
+class RelaxationSection(_keys(OF_TIME)):
     """[relaxation]: how the force relaxes; see `jaxtrachea.relaxation.laws`."""
 
     branches: Word = "prony-2"
@@ -357,35 +340,17 @@ def _one_or_auto(value: Any) -> Any:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-#: Former names in [effects], and what is written now.
-FORMER = "is now contact_point; write contact_point = 'fixed' for 'first', 'per_step' for 'each'"
-
-
-class _Effects(Section):
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "seat" in data:
-            raise ValueError(f"seat {FORMER}")
-        if isinstance(data, dict) and data.get("contact_point") in ("first", "each"):
-            raise ValueError(
-                f"contact_point: expected 'auto', 'fixed' (formerly 'first') or 'per_step' "
-                f"(formerly 'each'), found {data['contact_point']!r}"
-            )
-        return data
-
-
 def _levels(effect: Effect) -> Any:
     words = Literal[("auto", *effect.levels)]  # pyright: ignore
     return Annotated[words, BeforeValidator(_one_or_auto)], "auto"
 
 
-_Declared: Any = create_model(
-    "_Declared", __base__=_Effects, **{e.name: _levels(e) for e in EFFECTS.values()}
+_Effects: Any = create_model(
+    "_Effects", __base__=Section, **{e.name: _levels(e) for e in EFFECTS.values()}
 )
 
 
-class EffectsSection(_Declared):
+class EffectsSection(_Effects):
     """[effects], as `scene.effects` declares them; what is "auto" follows docs/simulate.md."""
 
 

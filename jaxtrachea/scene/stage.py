@@ -242,10 +242,11 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
 def touch_rows(tool: Shape, tube: Patches, path: Poses, quality: Settings, near: int) -> Touch:
     """`touch_tube`: of other plans of a scene too it is traced once."""
 
-    def one(R, T):
+    def one(tool, tube, R, T):
         return touch(tool, Pose(R, T), tube, quality, near=near)
 
-    return jax.vmap(fuse(one))(path.rotation, path.translation)
+    axes = (None, None, 0, 0)
+    return jax.vmap(fuse(one), axes)(tool, tube, path.rotation, path.translation)
 
 
 def at_row(v, row):

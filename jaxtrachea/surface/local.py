@@ -26,7 +26,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._linear import linear
 from jaxtrachea._numerics import added, epsilon, total
-from jaxtrachea.fusion import fuse
 
 #: Centres on circles round C, by the number of centres; the outermost circle is the collar.
 CIRCLES = {1: (), 8: (7,), 16: (6, 9), 32: (6, 10, 15)}
@@ -296,26 +295,22 @@ def add_correction(
     circles = len(CIRCLES[dent.centres.shape[0]])
     length = min(runs.longest[circles], points.shape[0])
 
-    def find(s_c, reach):
-        half = _half_width(circles, reach / REACH)
-        start = jnp.zeros((), jnp.int32)
-        if runs.s is not None:
-            first = jnp.searchsorted(runs.s, s_c - half).astype(jnp.int32)
-            start = jnp.minimum(first, points.shape[0] - length)
-        place = jnp.arange(points.shape[0], dtype=jnp.int32) if runs.rank is None else runs.rank
-        outside = (place < start) | (place >= start + length)
-        reached = jnp.abs(points[:, 0] - s_c) <= half * (1 - 5e-4)
-        whole = total((outside & reached).astype(jnp.int32)) == 0
+    half = _half_width(circles, dent.reach / REACH)
+    start = jnp.zeros((), jnp.int32)
+    if runs.s is not None:
+        first = jnp.searchsorted(runs.s, s_c - half).astype(jnp.int32)
+        start = jnp.minimum(first, points.shape[0] - length)
+    place = jnp.arange(points.shape[0], dtype=jnp.int32) if runs.rank is None else runs.rank
+    outside = (place < start) | (place >= start + length)
+    reached = jnp.abs(points[:, 0] - s_c) <= half * (1 - 5e-4)
+    whole = total((outside & reached).astype(jnp.int32)) == 0
 
-        def cut(v):
-            return jax.lax.dynamic_slice_in_dim(v, start, length)
+    def cut(v):
+        return jax.lax.dynamic_slice_in_dim(v, start, length)
 
-        run = cut(points) if runs.order is None else points[cut(runs.order)]
-        return start, whole, run.T
-
+    run = cut(points) if runs.order is None else points[cut(runs.order)]
     # By itself: of vertices that begin anywhere the processor would take one after the other.
-    start, whole, run = fuse(find)(s_c, dent.reach)
-    here = _columns(dent, run.T)
+    here = _columns(dent, jax.lax.optimization_barrier(run.T).T)
     rest = points.shape[0] - length
 
     def spread(v):

@@ -32,9 +32,9 @@ from jaxtrachea.contact.patches import straight_patches, touch  # noqa: E402
 from jaxtrachea.contact.pose import pose_from_vector  # noqa: E402
 from jaxtrachea.contact.shapes import box, sphere  # noqa: E402
 from jaxtrachea.fitting import fit  # noqa: E402
+from jaxtrachea.fitting.build import build_study, default_parameters  # noqa: E402
 from jaxtrachea.fitting.parameters import in_model  # noqa: E402
 from jaxtrachea.fitting.settings import Settings  # noqa: E402
-from jaxtrachea.fitting.study import build_study, default_parameters  # noqa: E402
 from jaxtrachea.measurements.read import Curve  # noqa: E402
 from jaxtrachea.mechanics.sections.material import from_wall  # noqa: E402
 from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections  # noqa: E402

@@ -18,6 +18,7 @@ import optimistix
 from scipy.optimize import least_squares
 
 from jaxtrachea.fitting import fit
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.noise import first_sigma
@@ -25,7 +26,6 @@ from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt

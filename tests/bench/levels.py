@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall

@@ -24,10 +24,10 @@ from scipy.signal import lfilter
 sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
 import relaxing_records
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.cost import evaluate
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.levels.options import Options
 

@@ -28,11 +28,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "reference"))
 import beam_fem
 import relaxing_records
 
+from jaxtrachea.fitting.assessment import assess
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
-from jaxtrachea.fitting.result import assess
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.trachea.geometry import Geometry

@@ -8,12 +8,7 @@ from report_peers import peers_section
 
 SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup", "peers", "growth",
           "gradient", "against")  # fmt: skip
-OPENSEES = (
-    "w_C, reactions",
-    "w_C, reactions, beam kept",
-    "bound press, array to array",
-    "bound press, array to named views",
-)
+OPENSEES = "w_C, reactions", "w_C, reactions, beam kept"
 DOCUMENT = FOLDER.parents[1] / "docs" / "evidence" / "benchmarks.md"
 
 
@@ -211,11 +206,9 @@ result waited for. *mid-tube*: clamped at 0 and 160 mm, contact at 83 mm. *canti
 problem of the package comparison, loaded at its free end, 155 mm. "Differs by": against ours,
 relative to the largest entry, asserted below 1e-8 before anything is timed. OpenSees keeps its
 model and repeats reset, analyze, reactions (BandSPD), as does our row "beam kept", whose rings and
-stiffness are constants of the program; *bound press* is `jt.bind`: it keeps the tube,
-reads the stiffnesses from one numpy array and solves the contact law besides. Our other rows read
-everything at every call. The numpy rows write a banded stiffness matrix by slices, solve it and
-multiply out the reactions. A jitted call that computes nothing shows how much of ours is JAX's own.
-All with
+stiffness are constants of the program. Our other rows read everything at every call. The numpy
+rows write a banded stiffness matrix by slices, solve it and multiply out the reactions. A jitted
+call that computes nothing shows how much of ours is JAX's own. All with
 `jax.config.update("jax_cpu_enable_async_dispatch", False)`: by default jax hands programs that it
 does not deem cheap to another thread, which costs 7 to 9 µs a call.
 """

@@ -18,7 +18,6 @@ import numpy as np
 from frames import Banded, Frame, opensees, with_dpbsv
 from scipy.linalg import solveh_banded
 
-from jaxtrachea import Geometry, Material, bind
 from jaxtrachea.mechanics.beam import Beam, contact_compliance, deflect
 
 # What jax does not deem cheap it hands to another thread: 7 to 9 us a call. Real-time loops, too,
@@ -27,8 +26,6 @@ jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 K, EI, FORCE, PITCH = 0.1, 1.86, 0.1, 10.0
 LANES = 4096
-PACKED = "jaxtrachea: bound press, array to array"
-NAMED = "jaxtrachea: bound press, array to named views"
 
 
 def beam(n: int = 15, length: float | None = None) -> Beam:
@@ -73,31 +70,7 @@ def our_calls(args: tuple) -> dict:
     return {
         "jaxtrachea: w_C, reactions": wait(lambda: run(*args)),
         "jaxtrachea: w_C, reactions, beam kept": wait(lambda: kept(*args[4:])),
-    } | packed_calls(args)
-
-
-def bound(args: tuple):
-    """`bind` on the same beam, and its numbers for the press that takes the same force.
-
-    It solves the contact law as well: k_1 = 1 N/mm, so that the tool goes further by the force.
-    """
-    x, length, bending, springs, s, F = map(np.asarray, args)
-    tube = Geometry(length, x, radius=10.0, half_angle=2.0, ring_height=4.0)
-    material = Material(EI_L=bending, k_M=springs, k_1=1.0, k_3=0.0)
-    w_C, _ = two_outputs(*args)
-    program = bind(tube, material, s, w_C + F)
-    return program, program.pack(material, s, w_C + F)
-
-
-def packed_calls(args: tuple) -> dict:
-    """One array in and one out, numpy at both ends; and with names for what came out."""
-    program, numbers = bound(args)
-
-    def named():
-        pressed = program.result(program(numbers))
-        return pressed.skeleton, pressed.reactions
-
-    return {PACKED: lambda: np.asarray(program(numbers)), NAMED: named}
+    }
 
 
 def more_calls(args: tuple) -> dict:
@@ -142,7 +115,6 @@ def single(out: common.Writer) -> None:
         except ImportError as error:
             out.note("single", f"{error}")
         errors = {case: differs(case, call(), expected) for case, call in rivals.items()}
-        errors[NAMED] = differs(NAMED, cases[NAMED](), expected)
         found = common.interleaved(cases | rivals, rounds=51, target=0.004)
         for case, samples in found.items():
             out.add("single", case, samples, problem=problem, error=errors.get(case))

@@ -14,14 +14,14 @@ from noisy_fits import DEPTHS, NOISE, UNSEEN, noisy_study, true_force
 from scipy.stats import t as student
 
 import jaxtrachea
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction.curves import predict_sources
 from jaxtrachea.prediction.model_error import model_errors
-from jaxtrachea.prediction.predict import predict_sources
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import source_of
 from jaxtrachea.results.hdf5 import write_hdf5

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import jaxtrachea
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import defaults_of
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

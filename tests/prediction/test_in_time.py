@@ -14,13 +14,13 @@ from run_cli import run
 
 import jaxtrachea
 from jaxtrachea.cli.main import main
+from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.branch_times import unsampled_time
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.predictions import predictions
-from jaxtrachea.fitting.result import assess
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.measurements.curve import Curve
 

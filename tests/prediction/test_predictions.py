@@ -15,13 +15,13 @@ from scipy.stats import t as student
 from synthetic import NAMES
 
 import jaxtrachea
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.refusals import deeper_than_validated, depths
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.labels import verdict_sentence
@@ -29,7 +29,7 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
-from jaxtrachea.prediction.predict import predict_sources
+from jaxtrachea.prediction.curves import predict_sources
 from jaxtrachea.prediction.sources import CurveParameters, source_of
 from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.results.hdf5 import write_hdf5
@@ -172,7 +172,7 @@ def test_a_curve_with_its_signs_turned_is_not_compared(read):
 
 def test_a_fit_that_knows_no_position_has_no_range_of_them():
     """Spans of curves without a position begin at inf and end at -inf."""
-    from jaxtrachea.prediction.predict import _beyond
+    from jaxtrachea.prediction.curves import _beyond
 
     nowhere, here = np.array([0.0, 2.0, np.inf, -np.inf]), np.array([0.0, 2.0, 10.0, 20.0])
     deep = np.array([0.0, 3.0])
@@ -183,7 +183,7 @@ def test_a_fit_that_knows_no_position_has_no_range_of_them():
 
 def test_an_angle_that_was_not_pressed_is_extrapolated():
     """Data at 0 to 30 deg along the normal; each angle is asked for by itself."""
-    from jaxtrachea.prediction.predict import _beyond
+    from jaxtrachea.prediction.curves import _beyond
 
     spans, angles = np.array([0.0, 2.0, 10.0, 20.0]), np.array([0.0, np.pi / 6])
     deep = np.array([0.0, 2.0])
@@ -218,7 +218,7 @@ def test_an_angle_that_sections_were_not_tested_at_is_refused(half_angle, most):
 
 def test_rows_where_the_wall_moves_further_than_the_radius_are_told():
     from jaxtrachea.prediction.core import Response
-    from jaxtrachea.prediction.predict import _verdict
+    from jaxtrachea.prediction.curves import _verdict
 
     source = source_like(PredictionStatus.OK)
     force = np.array([0.1, 0.2, 0.3])

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 import jaxtrachea
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

@@ -167,10 +167,10 @@ def fitted(chosen):
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    from jaxtrachea.fitting.build import build_study, default_parameters
     from jaxtrachea.fitting.fit import fit
     from jaxtrachea.fitting.parameters import in_model
     from jaxtrachea.fitting.settings import Settings
-    from jaxtrachea.fitting.study import build_study, default_parameters
     from jaxtrachea.measurements.read import Curve
     from jaxtrachea.mechanics.press import Options
     from jaxtrachea.trachea.geometry import table_1

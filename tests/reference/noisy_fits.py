@@ -4,9 +4,9 @@ import beam_fem
 import numpy as np
 import synthetic
 
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.trachea.geometry import table_1

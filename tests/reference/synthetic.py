@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.parameters import in_model
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import table_1

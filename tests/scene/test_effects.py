@@ -6,17 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_cli import run as run_cli
 from small_scenes import BALL, BARE, MATERIAL, SPRINGS, TUBE, ball, poses
 
 from jaxtrachea import Poses, make_scene, simulate, sweep
-from jaxtrachea.config import SpecError
-from jaxtrachea.scene.build import effects_of
 from jaxtrachea.scene.declare import RELAXES, RELAXES_APART, SceneFacts
 from jaxtrachea.scene.effects import EFFECTS, EffectOptions, goes_with
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.spec import EffectsSection, load_scene_spec
+from jaxtrachea.scene.spec import EffectsSection
 from jaxtrachea.status import PressStatus
 
 run, swept = jax.jit(simulate), jax.jit(sweep)
@@ -90,36 +87,7 @@ def test_the_second_plane_goes_without_friction():
     )  # fmt: skip
 
 
-SCENE = """
-[material]
-EI_L = "1.862 N mm^2"
-k_M = "0.1 N/mm"
-k_1 = "0.3 N/mm"
-k_3 = "0.02 N/mm^3"
-[path]
-s = "75 mm"
-displacement = ["0 mm", "-4 mm", "0 mm"]
-[effects]
-"""
-
-
-@pytest.mark.parametrize(
-    "line", ["seat = 'first'", "seat = 'auto'", "contact_point = 'each'", "contact_point = 'first'"]
-)
-def test_former_words_are_refused_with_the_new_ones(line, tmp_path, monkeypatch, capsys):
-    path = tmp_path / "scene.toml"
-    path.write_text(SCENE + line)
-    with pytest.raises(SpecError):
-        load_scene_spec(path)
-    code, _, err = run_cli(monkeypatch, capsys, "plan", path)
-    assert (code, "Traceback" in err, err.count("\n")) == (2, False, 1)
-    for words in ("effects", "contact_point", "'fixed'", "'per_step'"):
-        assert words in err
-    path.write_text(SCENE + "contact_point = 'per_step'\ndent = 8")
-    assert effects_of(load_scene_spec(path)).contact_point == "per_step"
-
-
-def test_former_words_are_refused_from_python():
+def test_words_of_no_meaning_are_refused_from_python():
     record = object.__new__(EffectOptions)  # as users do, without a checker of annotations
     for name, value in (vars(EffectOptions()) | {"contact_point": "each"}).items():
         object.__setattr__(record, name, value)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from jaxtrachea import EffectOptions, Presses, make_scene, simulate
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES, from_wall

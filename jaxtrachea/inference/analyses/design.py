@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.table import Column, Table
-from jaxtrachea.fitting.result import unknown_label
+from jaxtrachea.fitting.assessment import unknown_label
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import (
     Analysis,

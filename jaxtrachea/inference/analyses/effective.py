@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.effective import CORRELATED, Effective
-from jaxtrachea.fitting.result import assess
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import determined_unknowns, lane_label
 from jaxtrachea.inference.residuals import where_missed

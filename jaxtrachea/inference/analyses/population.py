@@ -56,7 +56,7 @@ def population_rows(of: Population) -> Iterator[Cells]:
         half = float(stdtrit(e.dof[j], 0.975) * e.mean_se[j])
         log = p.scale == "log"
         ends = np.array([e.sd[j], e.sd_low[j], e.sd_high[j]])
-        spread, low, high = map(float, np.exp(ends) if log else ends * p.step)
+        spread, low, high = map(float, p.from_scaled(ends))
         mean = float(e.mean[j])
         slope = p.from_scaled(mean) if log else p.step
         yield {

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.pictures import grid, of_all
 from jaxtrachea.files.table import Column, Interval, Table, number
-from jaxtrachea.fitting.result import unknown_label, within_bounds
+from jaxtrachea.fitting.assessment import unknown_label, within_bounds
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.profile import Profiles, profiles
@@ -160,7 +160,7 @@ def draw_profiles(found: Profiles):
         wide = np.ptp(found.coordinate[members]) > np.log(20)
         axis.set_xscale("log" if p.scale == "log" and wide else "linear")
         for k, colour in zip(members[:LINES], colours, strict=False):
-            at = np.array([p.from_scaled(v) for v in found.coordinate[k]])
+            at = p.from_scaled(found.coordinate[k])
             axis.plot(at, found.statistic[k], ".-", color=colour, lw=0.9, ms=3)
         axis.axhline(threshold[first], ls="--", color="#b4001e", lw=0.9)
         axis.text(0.99, threshold[first], "95 %", transform=axis.get_yaxis_transform(),
@@ -182,7 +182,7 @@ def _mark_interval(axis, found: Profiles, k: int) -> str:
     p, value = result.study.unknowns[lane][i][0], float(result.value[lane, i])
     axis.axvline(value, color="k", lw=0.8, label="estimate")
     ends = [float(v[k]) for v in (found.lower, found.upper)]
-    low, high = (p.from_scaled(float(v)) for v in found.coordinate[k][[0, -1]])
+    low, high = p.from_scaled(found.coordinate[k][[0, -1]])
     open_low = ends[0] == (0 if p.scale == "log" else -np.inf)
     shown = low if open_low else ends[0], high if ends[1] == np.inf else ends[1]
     if np.isfinite(shown).all():
@@ -191,8 +191,7 @@ def _mark_interval(axis, found: Profiles, k: int) -> str:
     if np.isfinite(se) and se > 0:
         theta = np.linspace(found.coordinate[k][0], found.coordinate[k][-1], 101)
         local = ((theta - result.theta[lane, i]) / se) ** 2
-        at = [p.from_scaled(v) for v in theta]
-        axis.plot(at, local, ":", color="k", lw=1, label="local error")
+        axis.plot(p.from_scaled(theta), local, ":", color="k", lw=1, label="local error")
     cell = Interval(float(found.lower[k]), float(found.upper[k]), p.scale == "log")
     return f"{number(value)} ({Column('', '', digits=4).text({'': cell})})"
 

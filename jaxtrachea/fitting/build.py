@@ -1,0 +1,330 @@
+"""From curves to a study: which model can press them, which unknowns they have, what is weighed."""
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from jaxtrachea._errors import InputError
+from jaxtrachea.fitting.curve_noise import weighed_by_curve
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lanes import (
+    Noise,
+    Taken,
+    Weighting,
+    curve_weights,
+    group,
+    lanes_of,
+    unknowns_of,
+    weighed_by_depth,
+)
+from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
+from jaxtrachea.fitting.onset import (
+    blends,
+    natural_steps,
+    onset_is_sought,
+    touches,
+    within_reach,
+)
+from jaxtrachea.fitting.parameters import (
+    DEFAULTS,
+    SKELETON,
+    Parameter,
+    defaults_of,
+    held,
+    in_model,
+)
+from jaxtrachea.fitting.refusals import Size, as_read, check_noise, depths, refusal
+from jaxtrachea.fitting.relaxing import by_records, span_of, with_span
+from jaxtrachea.fitting.study import Recipe, Study, first_touch_of
+from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
+from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
+from jaxtrachea.mechanics.levels.choose import level_of
+from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.trachea.geometry import Geometry
+
+#: Depth over the radius of the tube beyond which the noise of forces is looked for a share.
+DEEP = 0.1
+#: The table of parameters, or what differs from the defaults of the model, by name.
+Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
+
+
+def build_study(
+    curves: Measurements | Sequence[Curve],
+    geometry: Geometry,
+    options: Options = Options(),
+    parameters: Table | None = None,
+    *,
+    noise: Noise = Noise(),
+    weighting: Weighting = Weighting(),
+    tool_radius: float | None = None,
+    joint: bool = False,
+) -> Study:
+    """Put curves, model and parameters together.
+
+    Args:
+        curves: at least one; `s_c` set wherever the skeleton enters. Of `Measurements` the usable
+            ones; a warning names what could not be used. Side forces, sideward markers and ring
+            ends are read by the skeleton `sections` alone; else they are left out of the study,
+            and a warning says so.
+        geometry: the tube at rest (`Geometry.create` takes plain numbers; kept as float64).
+        options: what the model includes.
+        parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
+            the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True, "value": 1.9}}`, where what
+            is named is fitted unless it says `fixed`; None: the defaults. Of another wall than
+            `parameters.defaults_of` takes, the table by `default_parameters`. Rows that are `auto`
+            (onset and force offset by default, with them a line of the force before first touch,
+            `force_slope`) are fitted to those curves whose records show them. `{"force_slope": {}}`
+            fits that line to every curve, `{"force_slope": {"fixed": True, "value": 0}}` to none.
+        noise: known standard deviations; `force` is needed where some curves have a sigma of their
+            own and others have none.
+        weighting: balance between curves, the loss, and whether ends of pressed rings count.
+        tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
+            are used.
+        joint: one lane per specimen even if parameters are shared; without effect if none is, or
+            if there is but one specimen.
+
+    Raises:
+        ValueError: a `tool_radius` that is no length, none where `weighting` leaves pressed ends
+            out, no curve, one that cannot be pressed (`refusals`), with specimen and trial named;
+            a parameter that the model does not have; a `force_slope` that is free, and a curve
+            without 5 samples before first touch.
+    """
+    if tool_radius is not None and not 0 <= tool_radius < np.inf:
+        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
+    if not weighting.pressed_ends and tool_radius is None:
+        raise ValueError("pressed_ends=False needs tool_radius: which rings are under the tool")
+    curves, table = _admitted(curves, geometry, options, parameters)
+    check_noise(curves, noise.force)
+    recipe = Recipe(geometry, options, table, noise, weighting, tool_radius, joint, {})
+    return _built(curves, recipe)
+
+
+def with_zeros(study: Study, asked: Taken) -> Study:
+    """A study built again, in which curves take further zeros.
+
+    Args:
+        study: one with a recipe.
+        asked: names of `auto` parameters that curves take on top of those which their records show
+            and which the study has already.
+    """
+    recipe = study.recipe
+    assert recipe is not None
+    every = {k: {*recipe.asked.get(k, ()), *asked.get(k, ())} for k in {*recipe.asked, *asked}}
+    curves = [c for lane in study.curves for c in lane]
+    again = _built(curves, dataclasses.replace(recipe, asked=every))
+    return with_recipe(again, study.holdout_groups)
+
+
+def with_recipe(study: Study, holdout_groups: tuple[tuple[str, ...], ...]) -> Study:
+    """The study with groups of trials that are left out together, its recipe kept."""
+    out = dataclasses.replace(study, holdout_groups=holdout_groups)
+    object.__setattr__(out, "recipe", study.recipe)
+    return out
+
+
+def _built(curves: Sequence[Curve], recipe: Recipe) -> Study:
+    """The study of curves that the model can press."""
+    geometry, options, noise, weighting = (
+        recipe.geometry, recipe.options, recipe.noise, recipe.weighting,
+    )  # fmt: skip
+    own = resolved(recipe.parameters, curves, options, noise.force, recipe.asked)
+    parameters = natural_steps(own.parameters, curves, own.recorded, own.taken)
+    if level_of(options).relaxes:
+        span = span_of(curves)
+        parameters = by_records(parameters, options, span)
+        options = with_span(options, span)
+    joint = recipe.joint and any(p.scope == "shared" for p in parameters if not p.fixed)
+    joint = joint and len({c.specimen for c in curves}) > 1
+    groups = group(curves, parameters, joint=joint)
+    unknowns = [unknowns_of(lane, parameters, own.taken) for lane in groups]
+    lanes = lanes_of(
+        groups, unknowns, parameters, geometry,
+        noise=noise, weighting=weighting, tool_radius=recipe.tool_radius,
+        level=level_of(options),
+    )  # fmt: skip
+    if weighting.balance == "curve":
+        weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
+        lanes = lanes._replace(balance=weights)
+    if noise.force_by_curve:
+        lanes = weighed_by_curve(lanes, groups, joint=joint)
+    found = starts_of(own, groups, curves, lanes.s_c.shape[1])
+    lanes, change_points = _from_touch(lanes, groups, parameters, options, noise, found)
+    known = noise.force is not None or all(c.sigma is not None for c in curves)
+    model = FitModel(
+        tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
+        loss=weighting.loss, loss_scale=float(weighting.loss_scale),
+        common=_common(unknowns, parameters, own),
+    )  # fmt: skip
+    study = Study(
+        model=model,
+        parameters=tuple(parameters),
+        lanes=lanes,
+        curves=tuple(map(tuple, groups)),
+        unknowns=tuple(map(tuple, unknowns)),
+        noise_given=(known, noise.joints is not None),
+        marker_noise=None if noise.joints is None else (noise.joints, noise.joints_share),
+        joint=joint,
+        balance=weighting.balance,
+        change_points=change_points,
+        record_zeros=found,
+        force_share=_force_share(noise, known, lanes, parameters, change_points, model),
+    )
+    object.__setattr__(study, "recipe", recipe)
+    return study
+
+
+def _force_share(
+    noise: Noise,
+    known: bool,
+    lanes: Lane,
+    parameters: Sequence[Parameter],
+    change_points: np.ndarray | None,
+    model: FitModel,
+) -> float | Literal["estimate"] | None:
+    """The share that is asked for, or estimated by itself: of deep presses, sigma estimated.
+
+    Without a skeleton (coupling `total`) no press is too deep for it.
+    """
+    if noise.force_share is not None:
+        return noise.force_share or None
+    if model.options.coupling == "total":
+        return None
+    touch = first_touch_of(lanes, parameters, change_points)[..., None]
+    depth = depths(np.asarray(lanes.displacement), touch, model.options)
+    deepest = np.max(np.where(lanes.precision > 0, np.abs(depth), 0))
+    return None if known or deepest <= DEEP * float(model.geometry.radius) else "estimate"
+
+
+def _admitted(
+    curves: Measurements | Sequence[Curve],
+    geometry: Geometry,
+    options: Options,
+    parameters: Table | None,
+) -> tuple[Sequence[Curve], Sequence[Parameter]]:
+    """The curves as the model reads them, every one of which it can press, and the table."""
+    if isinstance(curves, Measurements):
+        _warn_of(curves.bad)
+        curves = curves.curves
+    if not curves:
+        raise ValueError("no usable curve; nothing to fit")
+    table, size = _table(parameters, options, curves, geometry), Size.of(geometry)
+    for curve in curves:
+        if (refused := refusal(curve, size, options, table)) is not None:
+            raise refused.error
+    curves, unused = as_read(curves, level_of(options))
+    if unused is not None:
+        warnings.warn(unused, stacklevel=3)
+    return curves, table
+
+
+def _from_touch(
+    lanes: Lane,
+    groups: Sequence[Sequence[Curve]],
+    parameters: Sequence[Parameter],
+    options: Options,
+    noise: Noise,
+    found: np.ndarray | None,
+) -> tuple[Lane, np.ndarray | None]:
+    """What follows from first touch: its rounded corner, its bounds, weights of markers by depth.
+
+    Curves that take no onset have a sharp corner, at 0. `found`: see `Study.record_zeros`; onsets
+    in it that lie among the samples are replaced by the change points.
+
+    Returns:
+        The lanes, and the change points of the curves (None: no first touch is sought).
+    """
+    seen = None
+    if onset_is_sought(parameters, options):
+        corners = touches(lanes, parameters, None if found is None else found[..., 2])
+        column = next(j for j, p in enumerate(parameters) if p.name == "onset")
+        own = lanes.index[:, :, column] >= 0
+        width = np.where(own, blends(corners, groups, noise.force, options), 0.0)
+        lanes = within_reach(lanes._replace(blend=width), parameters)
+        seen = np.where(own, corners.onset, np.nan)
+        if found is not None and parameters[column].auto:
+            first = np.min(np.where(lanes.precision > 0, lanes.displacement, np.inf), axis=2)
+            before = found[..., 0] <= first
+            seen = np.where(before, found[..., 0], seen)
+            found[..., 0] = np.where(np.isnan(found[..., 0]), np.nan, seen)
+    touch = first_touch_of(lanes, parameters, seen)
+    depth = depths(np.asarray(lanes.displacement), touch[..., None], options)
+    return weighed_by_depth(lanes, noise, depth), seen
+
+
+def _warn_of(bad: Sequence[BadCurve]) -> None:
+    """Say what could not be used; it is not forgotten in silence."""
+    if bad:
+        first = f"{bad[0].specimen} {bad[0].trial}: {bad[0].reason}"
+        more = f", and {len(bad) - 1} more" if len(bad) > 1 else ""
+        warnings.warn(f"curves left out: {first}{more}", stacklevel=4)
+
+
+def _table(
+    parameters: Table | None, options: Options, curves, geometry: Geometry
+) -> Sequence[Parameter]:
+    """The table itself, or the defaults of the model with changes."""
+    if parameters is not None and not isinstance(parameters, Mapping):
+        return parameters
+    changes = parameters or {}
+    joints = any(c.joint_displacement is not None for c in curves)
+    names = in_model(options, joints=joints, named=changes)
+    return default_parameters(names, changes, defaults_of(options, geometry))
+
+
+def _common(unknowns, parameters, own: Resolved) -> Common:
+    """See `FitModel.common`."""
+    free = [p.name for p in parameters if not p.fixed]
+    auto = {p.name for p in parameters if not p.fixed and p.auto}
+    names = [[p.name for p, _, _ in lane] for lane in unknowns]
+    if all(lane == free for lane in names) and all(auto <= v for v in map(set, own.taken.values())):
+        return "all"
+    beams = ([name for name in lane if name in SKELETON] for lane in names)
+    return "beam" if all(len(b) == len(set(b)) for b in beams) else "nothing"
+
+
+def default_parameters(
+    names: Sequence[str],
+    changes: Mapping[str, Mapping[str, object]],
+    defaults: Mapping[str, Parameter] = DEFAULTS,
+) -> tuple[Parameter, ...]:
+    """Table rows for `names` with the user's changes.
+
+    Args:
+        names: parameters of the model.
+        changes: fields of `Parameter` by name; whatever is named is fitted, unless `fixed` is true.
+        defaults: what is changed; see `parameters.defaults_of`.
+
+    Raises:
+        ValueError: a change names a parameter that the chosen model does not contain, or something
+            that a parameter does not have, or holds a first guess (`fixed` without `value`), or is
+            no mapping.
+    """
+    unknown = [name for name in changes if name not in names]
+    if unknown:
+        raise ValueError(
+            f"parameters.{unknown[0]}: not part of this model, which has {', '.join(names)}"
+        )
+    known = [f.name for f in dataclasses.fields(Parameter) if f.name != "name"]
+    for name, change in changes.items():
+        if not isinstance(change, Mapping):
+            raise ValueError(
+                f"parameters.{name}: found {change!r}; expected its fields, as in "
+                "{'fixed': True, 'value': 1.0}, or {} to fit it"
+            )
+        for key in change:
+            if key not in known:
+                raise ValueError(
+                    f"parameters.{name}: {key!r} is not known; expected one of {', '.join(known)}"
+                )
+        if change.get("fixed") is True and "value" not in change:
+            try:
+                held(defaults[name])
+            except InputError as error:
+                expected = "a value beside it, as in {'fixed': True, 'value': 1.0}"
+                key = f"parameters.{name}: fixed"
+                raise InputError.like(error, key=key, expected=expected) from None
+    fitted = {name: {"fixed": False, "auto": False, **v} for name, v in changes.items()}
+    return tuple(dataclasses.replace(defaults[n], **fitted.get(n, {})) for n in names)
