@@ -165,10 +165,9 @@ def test_same_as_one_by_one(name, block, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("seed", range(2))
-def test_same_for_records_at_random(seed):
+def test_same_for_records_at_random():
     """Ramps with noise, pauses, uneven clocks and reversals of all sizes, and holes in them."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     records = []
     for _ in range(300):
         n = int(rng.integers(2, 120))

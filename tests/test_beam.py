@@ -68,9 +68,7 @@ def assert_exact(errors, beam, s, solution, dtype):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    ("tube", "dtype"), [("1 ring", "float64"), ("15 rings", "float32"), ("15 rings", "float64")]
-)
+@pytest.mark.parametrize(("tube", "dtype"), [("1 ring", "float32"), ("15 rings", "float64")])
 def test_recursion_against_fem(tube, dtype):
     """Every quantity, relative to its largest value, for all k and all positions of C."""
     x, length, _ = beam_accuracy.tube(tube)
@@ -110,7 +108,7 @@ def _random_beam(rng, n, with_shear, with_load):
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     ("with_shear", "with_load", "dtype"),
-    [(True, True, "float64"), (False, False, "float64"), (True, False, "float32")],
+    [(True, True, "float64"), (True, False, "float32")],
 )
 def test_random_beams_against_fem(with_shear, with_load, dtype):
     """Own stiffness for each span and ring, Timoshenko shear, loads on the rings.
@@ -214,15 +212,7 @@ def test_reactions_same_answer(split, shear):
             np.testing.assert_allclose(p, q, atol=2e-9 * float(peak), rtol=0, err_msg=name)
 
 
-@pytest.mark.parametrize(
-    ("split", "shear"),
-    [
-        ("continuous", True),
-        ("independent", False),
-        pytest.param("continuous", False, marks=pytest.mark.slow),
-        pytest.param("independent", True, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("split", "shear"), [("continuous", True), ("independent", False)])
 def test_derivatives_of_both_forms(split, shear):
     """Between rings, on a ring (from the right, where they jump), and where a ring gives way."""
     b = table_1()

@@ -38,49 +38,27 @@ def parted_from_bounds(study, theta):
     return (gap != 0) & (gap < 1e-9 * (1 + np.abs(theta)))
 
 
-def check_lanes(count):
-    study, start = bounded.random_study(11, count)
-    sigma = first_sigma(study)
-    solved = levenberg_marquardt(LaneCost(study.model, study.lanes, sigma), start)
-    assert np.all(solved.status == FitStatus.CONVERGED), np.bincount(solved.status)
-    assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= promise_allowed(np.float64)
-    assert not np.any(parted_from_bounds(study, solved.theta))
-    return study, sigma, solved
-
-
-def check_nothing_lower(study, sigma, solved):
-    """`trf` from where the lanes end finds nothing lower that matters; returns the costs.
-
-    The difference is twice the log-likelihood ratio of 100 samples: 1e-4 standard errors.
-    """
-    cost = bounded.costs(study, solved.theta, sigma)
-    assert np.all(cost / bounded.scipy_costs(study, solved.theta, sigma) - 1 <= 1e-10)
-    return cost
-
-
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_random_bounds_against_scipy():
-    """Most lanes end on a bound."""
-    study, sigma, solved = check_lanes(60)
-    lanes = study.lanes
+    """Most lanes end on a bound; `trf` from where they end finds nothing lower that matters.
+
+    The difference is twice the log-likelihood ratio of 100 samples: 1e-4 standard errors.
+    """
+    study, start = bounded.random_study(11, 60)
+    sigma, lanes = first_sigma(study), study.lanes
+    solved = levenberg_marquardt(LaneCost(study.model, lanes, sigma), start)
+    assert np.all(solved.status == FitStatus.CONVERGED), np.bincount(solved.status)
+    assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= promise_allowed(np.float64)
+    assert not np.any(parted_from_bounds(study, solved.theta))
     assert np.mean(np.any((solved.theta == lanes.lower) | (solved.theta == lanes.upper), 1)) > 0.7
-    check_nothing_lower(study, sigma, solved)
-
-
-@pytest.mark.slow
-def test_1000_random_bounds():
-    """From the same starts SciPy and we end in the same minimum, but for 4 % of the lanes."""
-    study, sigma, solved = check_lanes(1000)
-    cost = check_nothing_lower(study, sigma, solved)
-    other = bounded.scipy_costs(study, bounded.random_study(11, 1000)[1], sigma)
-    assert np.sum(np.abs(cost / other - 1) > 1e-3) <= 40
+    cost = bounded.costs(study, solved.theta, sigma)
+    assert np.all(cost / bounded.scipy_costs(study, solved.theta, sigma) - 1 <= 1e-10)
 
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("gap", [0.0, 5e-14])
-def test_a_start_next_to_a_bound(gap):
+def test_a_start_next_to_a_bound():
     """The free optimum lies beyond: the others must not stay where it has them."""
     study, _ = bounded.random_study(11, 60)
     wide = study.lanes._replace(lower=np.full((60, 4), -12.0), upper=np.full((60, 4), 12.0))
@@ -91,7 +69,7 @@ def test_a_start_next_to_a_bound(gap):
     upper[:, 2] = best.theta[:, 2] - 0.3
     tight = bounded.with_lanes(study, wide._replace(upper=upper))
     start = best.theta.copy()
-    start[:, 2] = upper[:, 2] - gap
+    start[:, 2] = upper[:, 2] - 5e-14
     solved = levenberg_marquardt(LaneCost(tight.model, tight.lanes, sigma), start)
     assert np.all(solved.status == FitStatus.CONVERGED)
     assert np.all(solved.theta[:, 2] == upper[:, 2])

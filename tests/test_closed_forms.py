@@ -215,8 +215,7 @@ def test_each_end_moves_on_its_own_spring():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("free", ["k_A", "k_B"])
-def test_a_free_end_moves_as_the_contact_does(free):
+def test_a_free_end_moves_as_the_contact_does():
     """All vertices were NaN there, with status OK. The limit of weak springs, and its derivative.
 
     Between the free end and C nothing stretches: the surface there moves by what C does,
@@ -230,26 +229,24 @@ def test_a_free_end_moves_as_the_contact_does(free):
 
         return jax.tree.map(one, v)
 
-    other = {"k_A": "k_B", "k_B": "k_A"}[free]
-    material = dataclasses.replace(MATERIAL, **{other: 0.5, free: 0.0})
+    material = dataclasses.replace(MATERIAL, k_A=0.0, k_B=0.5)
     path = presses([-2, -4, 0], s=45.0, rows=2)
     effects = EffectOptions(rings="mat", contact="bonded", dent="off", want_joints=False)
     scene = make_scene(TUBE, material, path, mesh=MESH, effects=effects)
     scene, material, path = cast(scene), cast(material), cast(path)
 
     def moved(k):
-        out = simulate(scene, dataclasses.replace(material, **{free: k}), path)
+        out = simulate(scene, dataclasses.replace(material, k_A=k), path)
         return (out.vertices[-1] - scene.mesh.vertices)[:, 0], out
 
     run = jax.jit(lambda k: jax.jvp(moved, (k,), (jnp.ones_like(k),)))
     (u, out), (slope, _) = run(cast(0.0))
     assert out.status[-1] == PressStatus.OK
     assert u.dtype == "float64"
-    way = 160.0 - 45.0 if free == "k_A" else 45.0
-    wanted = float(out.force[-1, 0]) * (1 / 0.5 + way / 3.9)
+    wanted = float(out.force[-1, 0]) * (1 / 0.5 + (160.0 - 45.0) / 3.9)
     s, front = np.asarray(MESH.s), np.abs(np.asarray(MESH.phi)) < 0.2
-    beyond = front & ((s < 45) if free == "k_A" else (s > 45))
-    assert s[beyond].min() == 0 or s[beyond].max() == 160
+    beyond = front & (s < 45)
+    assert s[beyond].min() == 0
     eps = np.finfo("float64").eps
     # Vertices are read as places up to 160 mm away.
     np.testing.assert_allclose(u[beyond], wanted, atol=4 * eps * 160 + 1e3 * eps * abs(wanted))

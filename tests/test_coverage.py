@@ -48,10 +48,3 @@ def test_profiles_cover_where_local_errors_do_not():
     assert np.all(np.abs(profile - 0.95) <= 4 * np.sqrt(0.95 * 0.05 / 600)), profile
     # EI_L: the valley is curved; measured 90 % with 5,000 fits.
     assert local[0] < 0.93
-
-
-@pytest.mark.slow
-def test_profiles_cover_5000():
-    level = 0.1
-    _, profile = covered(level, 5000)
-    assert np.all((profile >= 0.93) & (profile <= 0.97)), profile

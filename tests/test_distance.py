@@ -16,7 +16,6 @@ from jaxtrachea.contact.distance import direction_table, signed_distance, track
 from jaxtrachea.contact.pose import (
     Pose,
     compose,
-    inverse,
     pose_from_quaternion,
     pose_from_vector,
     transform,
@@ -193,9 +192,7 @@ def with_derivatives(dtype):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    ("dtype", "scale"), [("float64", 1e-3), ("float64", 1e3), ("float32", 1.0)]
-)
+@pytest.mark.parametrize(("dtype", "scale"), [("float64", 1e-3), ("float32", 1.0)])
 def test_hard_cases(dtype, scale):
     """Exact - bound <= phi <= exact, the normal right, every value and derivative finite."""
     a, b, turn, shift, exact, law = (list(v) for v in zip(*HARD.values(), strict=True))
@@ -351,14 +348,8 @@ def check_pairs(index, settings_, dtype, scale, missed):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_random_pairs_in_single_precision():
-    check_pairs(np.arange(0, 2000, 8), STANDARD, "float32", 1e3, missed=2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("level", LEVELS)
-def test_all_random_pairs(level):
-    missed = {"fast": 6, "standard": 4, "fine": 2}[level]
+@pytest.mark.parametrize(("level", "missed"), [("fast", 6), ("standard", 4)])
+def test_all_random_pairs(level, missed):
     check_pairs(np.arange(2000), LEVELS[level], "float64", 1e-3, missed)
 
 
@@ -381,22 +372,6 @@ def place(v):
 
 
 cold_lanes = quick(jax.vmap(lambda v: signed_distance(A, B, place(v))))
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-@few
-@given(short_vectors, short_vectors)
-def test_swapping_the_shapes(w, t):
-    there = quick(pose_from_vector)(jnp.asarray(w), jnp.asarray(t))
-    one, two = solve(A, B, there), solve(B, A, quick(inverse)(there))
-    if abs(one.distance - two.distance) > 1e-9:  # a tie or a missed basin: only ever in overlap
-        assert max(one.lower, two.lower) < 0
-        return
-    if one.curvature < 1e-3 or np.linalg.norm(one.normal + there.rotation @ two.normal) > 1e-6:
-        assert one.distance < 0 or one.curvature < 1e-3
-        return
-    np.testing.assert_allclose(transform(there, two.point_b[:, None])[:, 0], one.point_a, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -436,17 +411,6 @@ def test_witness_points(name):
         assert abs(room[tight]) < 1e-12
         outside = d @ point - sharp_supports(shape, d)
         assert outside.max() <= np.log(8) / beta
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_lanes_are_single_calls():
-    batch = jnp.tile(jnp.stack(list(PLACES.values())), (40, 1))
-    together = cold_lanes(batch)
-    for i, v in enumerate(batch[:3]):
-        alone = solve(A, B, place(v))
-        for x, y in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-            np.testing.assert_allclose(x[i], y, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -519,11 +483,14 @@ def central(f, v, step):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("name", PLACES)
-def test_gradients(name):
+def test_gradients():
     """Pose and size of a box: reverse = forward = central differences; second = first of first."""
-    v, size = PLACES[name], jnp.array([1.0, 0.7, 0.4])
-    distance, both, second, turning = derivatives()
+    for v in PLACES.values():
+        check_gradients(v, *derivatives())
+
+
+def check_gradients(v, distance, both, second, turning):
+    size = jnp.array([1.0, 0.7, 0.4])
     near = solve(A, B, place(v)).normal
     (by_pose, by_size), forward = both(v, size, near)
     np.testing.assert_allclose(forward[0], by_pose, atol=1e-11)
@@ -593,15 +560,16 @@ def test_outcomes():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("start", [(1.0, 1, 0), (1.0, 1, 1), (0.0, -1, 1)])
-def test_a_saddle_by_symmetry_is_not_converged(start):
+def test_a_saddle_by_symmetry_is_not_converged():
     """A cube of 2 mm in itself is 2 mm deep, to a face; towards an edge or a corner 2.8 and 3.5."""
     cube, here = box(jnp.ones(3)), Pose(jnp.eye(3), jnp.zeros(3))
-    got = quick(lambda d: track(cube, cube, here, d))(jnp.asarray(start))
-    assert got.distance < -2.7
-    assert got.curvature < -0.5
-    assert got.status == ContactStatus.NOT_CONVERGED
-    face = quick(lambda d: track(cube, cube, here, d))(jnp.asarray([1.0, 0.01, 0.02]))
+    tracked = quick(lambda d: track(cube, cube, here, d))
+    for start in ((1.0, 1, 0), (1.0, 1, 1), (0.0, -1, 1)):
+        got = tracked(jnp.asarray(start))
+        assert got.distance < -2.7
+        assert got.curvature < -0.5
+        assert got.status == ContactStatus.NOT_CONVERGED
+    face = tracked(jnp.asarray([1.0, 0.01, 0.02]))
     np.testing.assert_allclose(face.distance, -2, atol=0.011)  # log(64) / sharpness of the size
     assert face.status == ContactStatus.OK
 

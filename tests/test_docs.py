@@ -75,17 +75,18 @@ frames = np.tile(np.eye(3), (len(s), 1, 1))
 tool, pose = sphere(2.0), pose_from_vector(jnp.zeros(3), jnp.array([75.0, 15.0, 0.0]))
 """,
 }
-#: Blocks that take longer than the default suite allows, and those that other tests run.
-SLOW = (
-    {("layer", i) for i in (3, 4, 5, 6)}
-    | {("haptics", i) for i in range(3)}
-    | {("contact", 0), ("contact", 1)}
-)
+#: Printed after each block of Python.
+END = "-- end of a block --"
+#: Blocks that other tests run.
 ELSEWHERE = {("README", 0): "test_readme.py", ("after_a_fit", 0): "test_docs.py"}
 
 
 def blocks(page, language):
     return re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)
+
+
+#: Pages with Python that no other test runs.
+WITH_PYTHON = [page for page in PAGES[1:] if blocks(page, "python")]
 
 
 def code_spans():
@@ -94,15 +95,6 @@ def code_spans():
         text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
         for span in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text):
             yield page.name, span
-
-
-def python_blocks():
-    for page in PAGES:
-        for i in range(len(blocks(page, "python"))):
-            key = (page.stem, i)
-            if key not in ELSEWHERE:
-                marks = [pytest.mark.slow] if key in SLOW else []
-                yield pytest.param(page, i, marks=marks, id=f"{page.stem}-{i}")
 
 
 def test_each_page_is_listed_once_and_says_who_needs_it():
@@ -137,16 +129,27 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(("page", "i"), list(python_blocks()))
-def test_python_runs(page, i, tmp_path):
-    code = BEFORE.get((page.stem, i), "") + blocks(page, "python")[i]
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda p: p.stem)
+def test_python_runs(page, tmp_path):
+    """All blocks of a page in one process, each as if by itself."""
+    code = {
+        (page.stem, i): BEFORE.get((page.stem, i), "") + text
+        for i, text in enumerate(blocks(page, "python"))
+        if (page.stem, i) not in ELSEWHERE
+    }
     (tmp_path / "fits").symlink_to(ROOT / "fits")
+    each = (
+        f"import jax\nfor code in {list(code.values())!r}:\n"
+        "    jax.config.update('jax_enable_x64', False)\n"
+        f"    exec(code, {{}})\n    print({END!r})"
+    )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+        [sys.executable, "-c", each], capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
-    if (page.stem, i) in FINDS:
-        FINDS[page.stem, i](done.stdout)
+    for key, out in zip(code, done.stdout.split(f"{END}\n"), strict=False):
+        if key in FINDS:
+            FINDS[key](out)
 
 
 def _press(out):

@@ -22,8 +22,6 @@ TWO = Options(local="two-material")
 NODES, WEIGHTS = (jnp.asarray(v) for v in np.polynomial.legendre.leggauss(12))
 #: name -> (material, options, rings)
 LEVELS = {
-    "springs": (MATERIAL, Options(), "mat"),
-    "two laws, rings of their own": (RICH, TWO, "arch2"),
     "softening": (dataclasses.replace(MATERIAL, k_3=jnp.array(-0.004)), Options(), "arch2"),
     "bonded": (RICH, dataclasses.replace(TWO, contact="bonded"), "arch2"),
 }

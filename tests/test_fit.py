@@ -64,34 +64,6 @@ def test_noise_free_data_give_back_the_parameters():
     assert (~succeeded).sum() <= 0.01 * draws
 
 
-def _coverage(count, given):
-    truth = synthetic.draw(3, count, 1.3, CLEAR)
-    force, _ = synthetic.forces(truth)
-    sigma = 0.01 * np.abs(force).max((1, 2), keepdims=True)
-    force = force + sigma * np.random.default_rng(4).normal(size=force.shape)
-    changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
-    if given:
-        data = [
-            dataclasses.replace(c, sigma=np.full(50, sigma[int(c.specimen[1:]), 0, 0]))
-            for c in synthetic.curves(force)
-        ]
-        study = build_study(
-            data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(**changes)
-        )
-    else:
-        study = synthetic.study(force, changes=changes)
-    result = fit(study, ONE)
-    assert np.all(result.status == FitStatus.CONVERGED)
-    return np.mean((result.lower <= truth) & (truth <= result.upper), axis=0)
-
-
-@pytest.mark.slow
-def test_intervals_cover_5000():
-    given = False
-    covered = _coverage(5000, given)
-    assert np.all((covered >= 0.93) & (covered <= 0.97)), covered
-
-
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_a_batch_is_its_lanes_one_by_one(noisy):
@@ -293,30 +265,6 @@ def test_a_bound_is_hit_and_said(noisy):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_onset_and_offset_of_each_trial_are_recovered():
-    """Each trial touches elsewhere and its load cell has another zero."""
-    onset, offset = np.array([0.31, 0.47, 0.22, 0.6]), np.array([0.05, -0.1, 0.2, 0.0])
-    force = np.stack(
-        [
-            synthetic.forces(CLEAR[None], S, synthetic.DEPTHS - d)[0][0, 0] + f
-            for S, d, f in zip(synthetic.S_C[:, None], onset, offset, strict=True)
-        ]
-    )[None]
-    changes = {
-        "onset": {"fixed": False, "value": 0.3, "lower": 0.0, "upper": 3.0},
-        "force_offset": {"fixed": False},
-    }
-    result = fit(synthetic.study(force, changes=changes), ONE)
-    assert result.value.shape == (1, 12)
-    value = {(p.name, t): v for (p, _, t), v in zip(result.study.unknowns[0], result.value[0])}  # noqa: B905
-    np.testing.assert_allclose([value["onset", f"t{j}"] for j in range(4)], onset, atol=1e-5)
-    np.testing.assert_allclose(
-        [value["force_offset", f"t{j}"] for j in range(4)], offset, atol=1e-5
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
 def test_unequal_lengths_do_not_change_results():
     """A short curve padded beside long ones gives what it gives alone."""
     truth = synthetic.draw(11, 2, 1.2, CLEAR)
@@ -382,13 +330,12 @@ def test_markers_with_both_noise_levels_estimated():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_robust_losses_as_scipy(noisy, loss):
+def test_robust_loss_as_scipy(noisy):
     """Outliers in one lane; the same loss, scale and sigma in scipy give the same estimate."""
     _, force, sigma = noisy
     force, level = force[:1].copy(), float(sigma[0, 0, 0])
     force[0, :, ::9] += 20 * level
-    study = synthetic.study(force, weighting=Weighting(loss=loss), noise=Noise(force=level))
+    study = synthetic.study(force, weighting=Weighting(loss="cauchy"), noise=Noise(force=level))
     result = fit(study, ONE)
     assert result.status[0] == FitStatus.CONVERGED
 
@@ -396,7 +343,7 @@ def test_robust_losses_as_scipy(noisy, loss):
         return (synthetic.forces(np.exp(theta)[None])[0][0] - force[0]).ravel() / level
 
     other = least_squares(
-        residual, result.theta[0] + 0.02, "3-point", loss=loss, f_scale=1.345, xtol=1e-12,
+        residual, result.theta[0] + 0.02, "3-point", loss="cauchy", f_scale=1.345, xtol=1e-12,
         ftol=1e-14, gtol=1e-10, x_scale="jac", max_nfev=500,
     )  # fmt: skip
     assert result.cost[0] <= other.cost * (1 + 1e-8)

@@ -151,7 +151,7 @@ def test_page_holds_the_recorded_numbers():
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
-    "known", EXPECTED["options"][::2], ids=lambda o: f"{o['shear']} {o['local']} {o['half_width']}"
+    "known", EXPECTED["options"][::3], ids=lambda o: f"{o['shear']} {o['local']} {o['half_width']}"
 )
 def test_other_options(known, monkeypatch):
     only_shipped(known, SHIPPED, monkeypatch)
@@ -162,7 +162,7 @@ def test_other_options(known, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
-    "known", EXPECTED["finite_strain"][::2], ids=lambda o: f"{o['depth_mm']} mm {o['skeleton']}"
+    "known", EXPECTED["finite_strain"][:1], ids=lambda o: f"{o['depth_mm']} mm {o['skeleton']}"
 )
 def test_finite_strain(known, monkeypatch):
     only_shipped(known, EXPECTED["finite_strain"][-1], monkeypatch)

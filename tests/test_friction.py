@@ -229,17 +229,6 @@ def test_what_sticks_is_stretched_from_where_it_touched():
 
 
 @pytest.mark.slow
-def test_steps_that_are_lost_in_the_air_move_nothing():
-    """One that is no number, and one that folds as it touches: as if they were not there."""
-    good = from_the_air(2)
-    for at, lost in ((1, [np.nan, 9, 9]), (1, [50.0, 9, 9]), (0, [-0.5, np.nan, 0])):
-        D = np.insert(good, at, lost, axis=0)
-        got, wanted = (path(v, COUPLED, 0.5, -0.01) for v in (D, good))
-        np.testing.assert_allclose(np.delete(got.force, at, 0), wanted.force, rtol=1e-12)
-        np.testing.assert_allclose(np.delete(got.slip, at, 0), wanted.slip, rtol=1e-12)
-
-
-@pytest.mark.slow
 def test_gradients_through_touches():
     """Forward = reverse = central differences; of a path that never touches all are 0."""
     D = np.concatenate([[[-1.2, 0.1, 0]], from_the_air(1)])
@@ -319,15 +308,14 @@ def test_rounding():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rounding", [0.05, 0.0])
-def test_gradients(rounding):
+def test_gradients():
     """Forward = reverse = central differences through a path that sticks, slides and turns."""
     x = np.array([0.0, 0.3, 1.9, 2.6, 1.2, -2.0])
     point = {"D": sideways(x) + 0.1 * np.cos(np.arange(18)).reshape(6, 3), "C": COUPLED}
     point |= {"k_1": 0.7, "k_3": 0.3, "mu": MU}
 
     def f(v):
-        got = slide_path(v["D"], v["C"], Law(v["k_1"], v["k_3"]), Coulomb(v["mu"], rounding))
+        got = slide_path(v["D"], v["C"], Law(v["k_1"], v["k_3"]), Coulomb(v["mu"], 0.05))
         return jnp.concatenate([got.force.ravel(), got.slip.ravel()])
 
     here = {n: jnp.asarray(v) for n, v in point.items()}

@@ -20,8 +20,6 @@ from jaxtrachea import (
     build_study,
     deflect,
     make_scene,
-    simulate,
-    sweep,
     table_1,
 )
 from jaxtrachea.contact.shapes import sphere
@@ -79,22 +77,12 @@ def scene():
     return make_scene(geometry, MATERIAL, poses(number(73.0)), tool=ball, mesh=mesh)
 
 
-def simulated(s):
-    found = simulate(scene(), MATERIAL, poses(s))
-    return found.force, found.vertices, found.joints
-
-
 def stepped(s):
     path = poses(s)
     here = path.rotation[0], path.translation[0]
     state = step._start(scene(), None)
     _, found, press = step.move_tool(scene(), MATERIAL, state, *here)
     return found.force, surface(scene(), *press), found.joints
-
-
-def swept(s):
-    found = sweep(scene(), MATERIAL, s[None], s[None] * 0, s[None] * 0 + 1)
-    return found.force, found.compliance
 
 
 def dense(s):
@@ -118,10 +106,7 @@ def fit(theta):
 
 
 CASES = [
-    pytest.param(sections(0.0), id="sections", marks=pytest.mark.slow),
     pytest.param(sections(1.5), id="sections, off the midline", marks=pytest.mark.slow),
-    pytest.param(simulated, id="scene", marks=pytest.mark.slow),
-    pytest.param(swept, id="sweep", marks=pytest.mark.slow),
     pytest.param(stepped, id="session", marks=pytest.mark.slow),
     pytest.param(dense, id="beam", marks=pytest.mark.slow),
     pytest.param(fit, id="fit"),
@@ -133,7 +118,7 @@ def test_products_of_a_value_and_its_gradient(f):
     def total(s):
         return sum(jnp.sum(v) for v in jax.tree.leaves(f(s)))
 
-    if f in (simulated, stepped, swept):
+    if f is stepped:
         scene()  # made outside of the programs
     found = products(jax.grad(jax.jit(total)), number(13.0)) + products(f, number(13.0))
     assert found

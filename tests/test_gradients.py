@@ -100,11 +100,10 @@ def deflection(split, form, loaded=False):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("s", [25.3, 5.5])
-@pytest.mark.parametrize("k", [1e-9, 0.1, 1e12])
 @pytest.mark.parametrize("f", [compliance, compliance_independent])
-def test_compliance(f, k, s):
-    check(f, beam_values(s, k), rtol=3e-6)
+def test_compliance(f):
+    for s, k in ((25.3, 1e-9), (5.5, 0.1), (25.3, 1e12)):
+        check(f, beam_values(s, k), rtol=3e-6)
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from late import late
 
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.status import PressStatus
@@ -77,12 +76,8 @@ def test_value_and_gradient(name):
     assert all(np.isfinite(v) for v in gradient.values())
 
 
-OTHERS = [n for n, c in CASES.items() if c[2] == PressStatus.OK and n != "200 rings"]
-
-
-@pytest.mark.parametrize("name", ["200 rings", *late(*OTHERS)])
-def test_float32_agrees_with_float64(name):
-    one, two = (solved(name, dtype)[0] for dtype in DTYPES)
+def test_float32_agrees_with_float64():
+    one, two = (solved("200 rings", dtype)[0] for dtype in DTYPES)
     np.testing.assert_allclose(one.force, two.force, rtol=2e-5)
     np.testing.assert_allclose(one.compliance, two.compliance, rtol=2e-5)
     peak = float(jnp.max(jnp.abs(two.reactions)))

@@ -148,14 +148,11 @@ def check(found, mesh, geometry, atol=0.35, scale=1.0):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    ("suffix", "scale", "unit"), [("stl", 1.0, None), ("obj", 0.1, "cm"), ("glb", 1e-3, None)]
-)
-def test_round_trip(tmp_path, suffix, scale, unit):
-    path = write(tmp_path / f"tube.{suffix}", scale=scale)
-    found = read_mesh(path, LARYNX, unit=unit)
-    check(found, TUBE, GEOMETRY, scale=scale)
-    np.testing.assert_allclose(found.scale, 1 / scale)
+def test_round_trip(tmp_path):
+    path = write(tmp_path / "tube.obj", scale=0.1)
+    found = read_mesh(path, LARYNX, unit="cm")
+    check(found, TUBE, GEOMETRY, scale=0.1)
+    np.testing.assert_allclose(found.scale, 10)
     np.testing.assert_allclose(found.geometry.half_angle, 2 * math.pi / 3, atol=0.2)
     vertices, faces = as_arrays(found.mesh)
     np.testing.assert_allclose(
@@ -293,7 +290,6 @@ def test_progress_comes_to_its_end(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("given", [{}, {"anterior": ROTATION @ Z, "ring_positions": RINGS}])
 @pytest.mark.parametrize(
     ("angle", "message"),
     [
@@ -301,8 +297,9 @@ def test_progress_comes_to_its_end(tmp_path):
         (120, r"centreline found runs 1\.\d mm beside the middle of its cross-sections"),
     ],
 )
-def test_a_u_bend_is_refused(tmp_path, given, angle, message):
+def test_a_u_bend_is_refused(tmp_path, angle, message):
     """With its rings and front given it was read: straight, and of another length."""
+    given = {"anterior": ROTATION @ Z, "ring_positions": RINGS}
     vertices, faces = as_arrays(TUBE)
     radius = 92 / math.radians(angle)
     around = bent(vertices * [1, -1, 1], radius)

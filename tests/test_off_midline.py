@@ -45,16 +45,6 @@ def test_errors_are_the_recorded_ones():
         np.testing.assert_allclose(found["midline"][name], value, atol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_fit_is_the_recorded_one():
-    data = script.read()
-    rows = np.flatnonzero(data["phi_c"] == 0)
-    found = script.fit(*script.LEVELS["arch2"], rows, data)
-    for name, value in of("arch2", "midline")["parameters"].items():
-        np.testing.assert_allclose(found[name], value, rtol=1e-2, err_msg=name)
-
-
 def test_what_the_page_claims():
     """The sentences with numbers in docs/evidence/off_midline.md."""
     mat, arch, arch2 = (of(rings, "midline") for rings in ("mat", "arch", "arch2"))

@@ -14,9 +14,8 @@ from jaxtrachea._numerics import centred_hinge
 from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
-from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.inference.analysis import AnalysisResults
+from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out, without
 from jaxtrachea.inference.design.candidates import Candidates, check
 from jaxtrachea.inference.design.choice import gains
@@ -28,10 +27,6 @@ from jaxtrachea.inference.weakest_direction import describe_weakest
 from jaxtrachea.measurements.first_touch import first_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, compliance
-from jaxtrachea.prediction.held_out import compare
-from jaxtrachea.prediction.pressed import pressed
-from jaxtrachea.results.hdf5 import write_hdf5
-from jaxtrachea.results.read import read_results
 from jaxtrachea.trachea.material import Material
 
 ONE = Settings(starts=1, verify=False)
@@ -159,20 +154,6 @@ def test_rounding_moves_the_onset_by_little_of_its_error(studied):
             found = least_squares(misfit, [np.log(value[0]), value[1], value[3]], x_scale="jac")
             best = min(best, (found.cost, onset))
         assert abs(best[1] - value[2]) <= 0.2 * result.standard_error[k, 2]
-
-
-@pytest.mark.slow
-def test_intervals_of_many_noisy_curves_cover():
-    """1,500 curves: 95 % intervals of k_1 hold it in 93 to 97 %, and the onset hardly fewer."""
-    curves, truth = noisy_curves(1500, 2, samples=120)
-    result = fit(pressed_study(curves), Settings())
-    assert result.succeeded.mean() >= 0.999
-    inner = ~result.at_bound.any(axis=1)
-    inside, z = coverage(result, truth)
-    assert 0.93 <= inside[inner, 0].mean() <= 0.97
-    assert 0.92 <= inside[inner, 2].mean() <= 0.97
-    # The rounded corner biases by less than a tenth of the standard error.
-    assert np.all(np.abs(np.median(z[inner], axis=0)) < 0.1)
 
 
 def test_change_point_of_exact_curves():
@@ -348,23 +329,3 @@ def test_where_no_onset_is_fitted_nothing_changes():
     study = synthetic.study(force)
     assert study.lanes.blend is None
     assert study.parameters[-1].step == 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path):
-    """Used curves come back to 1e-9 N; a press ten times as deep, in other steps: SciPy."""
-    write_hdf5(tmp_path / "results.h5", AnalysisResults(owned), {})
-    read = read_results(tmp_path)
-    (k_1, k_3), D = owned.value[0, :2], np.linspace(0, 50, 80)
-    force = k_1 * np.maximum(D - 4, 0) + k_3 * np.maximum(D - 4, 0) ** 3 + 0.2
-    force = force + 0.05 * np.random.default_rng(3).normal(size=80)
-    deep = Curve("s0", "deep", 20.0, 0.0, D, force)
-    *used, found = compare(read, [*pressed(read).curves, deep])
-    seen = predictions(owned.study, owned.theta).force.reshape(8, 80)
-    assert {c.in_fit for c in used} == {"yes"}
-    np.testing.assert_allclose([c.residual for c in used], seen, rtol=0, atol=1e-9)
-    assert next(p.step for p in read.study.free if p.name == "onset") == 1.0
-    np.testing.assert_allclose(
-        found.residual, own_misfit(deep, k_1, k_3, [4.0, 0.2]), atol=1e-4 * np.max(force)
-    )

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from late import late
 from scipy.optimize import minimize
 from scipy.stats import chi2, multivariate_normal, t
 
@@ -113,13 +112,10 @@ def test_errors_that_all_have_in_common():
     assert np.all(np.abs(np.mean(rows, axis=0) - 0.95) < 0.05)
 
 
-@pytest.mark.parametrize(
-    ("good", "others", "error"), [(4, 10, 10.0), pytest.param(3, 20, 5.0, marks=pytest.mark.slow)]
-)
-def test_specimens_that_say_nothing_are_no_degrees_of_freedom(good, others, error):
+def test_specimens_that_say_nothing_are_no_degrees_of_freedom():
     """With t of m - 1 intervals of the mean held 81 to 85 %, of the spread 78 to 85 %."""
     rng, rows = np.random.default_rng(7), []
-    se = np.array([0.1] * good + [error] * others)
+    se = np.array([0.1] * 4 + [10.0] * 10)
     for _ in range(300):
         y = rng.normal(size=len(se)) + se * rng.normal(size=len(se))
         e = random_effects(y[:, None], (se**2)[:, None, None])
@@ -190,8 +186,7 @@ def test_what_the_data_hardly_determine_takes_part():
     assert abs(spread - truth.std(ddof=1)) < 0.06
 
 
-@pytest.mark.parametrize("scale", ["log", *late("linear")])
-def test_logarithms_of_what_is_hardly_determined_are_told(scale):
+def test_logarithms_of_what_is_hardly_determined_are_told():
     """k_1 of 0.03 to 0.08 with errors of 0.026: 0.052 and less of them have errors above half."""
     rng, D = np.random.default_rng(2), np.linspace(0, 1.1, 16)
     sigma = 0.026 * np.sqrt(np.sum(D**2))
@@ -199,14 +194,14 @@ def test_logarithms_of_what_is_hardly_determined_are_told(scale):
         Curve(f"s{i:02d}", "1", 75.0, 0.0, D, k * D + rng.normal(0, sigma, 16))
         for i, k in enumerate(np.linspace(0.03, 0.2, 40))
     ]
-    table = {"k_1": {"scale": scale}, "k_3": {"fixed": True, "value": 0.0}}
+    table = {"k_1": {"scale": "log"}, "k_3": {"fixed": True, "value": 0.0}}
     options, noise = Options(coupling="total"), Noise(force=sigma)
     result = fit(build_study(curves, table_1(), options, table, noise=noise))
     found = population(without_growth(result))
     below = np.sum(found.known & (0.026 > 0.5 * found.result.value[:, :1]))
     assert (found.undetermined[0], below > 4) == (below, True)
     told = [text for text in POPULATION.warning(found) if "errors above half the value" in text]
-    assert len(told) == (scale == "log")
+    assert len(told) == 1
 
 
 def test_estimates_on_a_bound_are_told():

@@ -50,13 +50,11 @@ def run(material, relaxes, options, time=TIMES, way=WAY, s_c=22.0):
     ("change", "material"),
     [
         ({}, QUINTIC),
-        pytest.param({}, Material(**VALUES), marks=pytest.mark.slow),
         ({"local": "two-material"}, dataclasses.replace(QUINTIC, k_1_ring=jnp.asarray(2.0))),
-        pytest.param({"half_width": 3.0}, QUINTIC, marks=pytest.mark.slow),
         ({"contact": "bonded"}, QUINTIC),
         ({"skeleton": "softening"}, Material(**VALUES, e_1=0.08, e_2=0.003)),
     ],
-    ids=["quintic", "cubic", "two-material", "width", "bonded", "softening"],
+    ids=["quintic", "two-material", "bonded", "softening"],
 )
 def test_parts_that_relax_alike_are_the_uniform_level(change, material):
     """With lift-off and recovery; two programs that share no equilibrium."""
@@ -186,19 +184,16 @@ def test_a_branch_that_is_none_is_told():
         assert np.isnan(found.force).all()
 
 
-@pytest.mark.parametrize(
-    "options", [pytest.param(UNIFORM, marks=pytest.mark.slow), PARTS], ids=["uniform", "parts"]
-)
-def test_derivatives_through_lift_off(options):
+def test_derivatives_through_lift_off():
     """By stiffnesses, branches and displacement, in both modes."""
     way = np.interp(TIMES[::8], [0, 1, 6, 7, 9, 10], [0, 4, 4, 0.2, 0.2, 3])
-    parts = options.relaxation == "parts"
 
     def of(values, log_gamma, log_tau, way):
         material = Material(values[0], values[1], values[2], values[3], k_5=values[4])
         branches = Branches(jnp.exp(log_gamma), jnp.exp(log_tau))
-        relaxes = Relaxation(branches, OTHER if parts else None)
-        found = run(material, relaxes, options, jnp.asarray(TIMES[::8]), jnp.asarray(way))
+        found = run(
+            material, Relaxation(branches, OTHER), PARTS, jnp.asarray(TIMES[::8]), jnp.asarray(way)
+        )
         return found.force[1:], found.depth[1:], found.skeleton[1:]
 
     values = jnp.asarray([60.0, 3.0, 0.3, 0.02, 0.003])

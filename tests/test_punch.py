@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import punch_fem
 import pytest
-from jax.test_util import check_grads
 from kernels import computations
 from scipy.integrate import quad
 
@@ -68,25 +67,6 @@ def test_rotation_is_half_of_what_the_place_changes(s):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_a_punch_too_narrow_for_its_digits_says_nothing():
-    """Without shear, where two points a width apart differ by the square of it."""
-    s, D = jnp.asarray(35.0, "float64"), jnp.asarray([1.0], "float64")
-    material = Material(*(jnp.asarray(v, "float64") for v in (1200.0, 0.2, 6.8, 0.01)))
-    tube, limit = table_1("float64"), 1e-4
-    for half in (limit, 1e-2 * limit, 1e-8 * limit):
-        got = press(tube, material, s, D, Options(half_width=half))
-        if half < limit:
-            assert got.status[0] == PressStatus.NON_FINITE
-            assert np.isnan(got.force[0])
-            continue
-        true = punch_fem.held(X, LENGTH, np.full(16, 1200.0), np.full(15, 0.2), 35.0, 0.05, None)
-        assert got.status[0] == PressStatus.OK
-        np.testing.assert_allclose(got.compliance, true.w_C, rtol=2e-3)
-        np.testing.assert_allclose(got.joints[0], float(got.force[0]) * true.w, atol=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
 def test_narrow_punch_is_a_point_that_does_not_tilt():
     """As the square of the width, in the middle of a uniform beam, where a point does not either.
 
@@ -100,19 +80,6 @@ def test_narrow_punch_is_a_point_that_does_not_tilt():
     np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.1)
     for end in (0.0, 1.0, 159.0, 160.0):
         assert punch_deflection(beam(), jnp.asarray(end), HALF).w_C == 0
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_derivatives():
-    def values(s, EI, k, GA):
-        s, EI, k, GA = map(jnp.asarray, (s, EI, k, GA))
-        out = punch_deflection(Beam(jnp.asarray(X), jnp.asarray(LENGTH), EI, k, GA), s, HALF)
-        return out.w_C, out.w
-
-    for s in (35.5, 31.0):
-        args = (jnp.asarray(s), jnp.asarray(EI), jnp.asarray(K), jnp.asarray(GA))
-        check_grads(jax.jit(values), args, 1, rtol=1e-4)
 
 
 def test_continuous_over_a_ring():
@@ -226,20 +193,17 @@ def test_lanes_find_the_deflections_once(skeleton):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("skeleton", ["linear", "softening"])
-def test_beyond_an_end_is_refused(skeleton):
+def test_beyond_an_end_is_refused():
     """No punch stands on a clamp: OFF_TUBE, NaN; its derivatives are 0, good rows keep theirs.
 
     With its edge just on the end it stands there: rigid for forces, as a point at the end is.
     """
-    options = Options(shear=True, local="two-material", half_width=2.5, skeleton=skeleton)
-    wide = Options(shear=True, half_width=80.5, skeleton=skeleton)
+    options = Options(shear=True, local="two-material", half_width=2.5, skeleton="softening")
+    wide = Options(shear=True, half_width=80.5, skeleton="softening")
     places = [75.0, 2.5, 157.5, 2.4, 157.6, 0.0, 160.0, -1.0, 162.0]
     values = {"EI_L": 1930.0, "k_M": 0.2126, "k_1": 8.18, "k_3": 0.1, "GA_L": 6.97,
               "k_1_ring": 40.0, "e_1": 0.1, "e_2": 0.005}  # fmt: skip
     geometry = table_1(dtype="float64")
-    if skeleton == "linear":
-        values = {k: v for k, v in values.items() if not k.startswith("e_")}
 
     def press_row(options, s, values):
         return press(geometry, Material(**values), s, 0.1, options)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from admitted import FULL
+from late import late
 
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.levels.level import Motion
@@ -75,10 +76,7 @@ READ = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "which",
-    ["press", *(pytest.param(n, marks=pytest.mark.slow) for n in ("oblique", "path", "skeleton"))],
-)
+@pytest.mark.parametrize("which", ["press", *late("path", "skeleton")])
 def test_statuses_in_a_batch(which):
     """Off the tube and each negative stiffness in turn: NaN with a status of their own.
 

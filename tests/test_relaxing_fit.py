@@ -66,15 +66,9 @@ def curve(s, trial="a", options=Options(), gamma=GAMMA, noise=0.0, **more):
 RELAXING = Options(relaxation="uniform")
 KINDS = {
     "line": (RELAXING, False),
-    "markers": (RELAXING, True),
-    "softening": (dataclasses.replace(RELAXING, skeleton="softening"), True),
-    "bonded": (dataclasses.replace(RELAXING, contact="bonded"), True),
     "fung": (dataclasses.replace(RELAXING, branches="fung"), False),
     "parts": (dataclasses.replace(RELAXING, relaxation="parts", skeleton="softening"), True),
-    "parts, bonded": (
-        dataclasses.replace(RELAXING, relaxation="parts", contact="bonded"), False,
-    ),
-}  # fmt: skip
+}
 
 
 def point_of(study, seed=3):
@@ -82,7 +76,7 @@ def point_of(study, seed=3):
     return jnp.asarray(guess + 0.2 * np.random.default_rng(seed).normal(size=guess.size))
 
 
-@pytest.mark.parametrize("kind", ["line", "parts", *late("markers", "bonded", "fung")])
+@pytest.mark.parametrize("kind", ["line", "parts", *late("fung")])
 def test_residual_is_that_of_the_press_in_time(kind):
     """In closed form beside `press_in_time` in forward mode, through lift-off."""
     options, marked = KINDS[kind]

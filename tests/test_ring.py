@@ -286,12 +286,14 @@ value = jax.jit(_all, compiler_options=QUICK)
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("phi", [0.0, -1.9])
-@pytest.mark.parametrize("changes", [{}, {"k_t": 20.0, "EI": 1e3}, {"k_t": 0.975}])
-def test_gradients(phi, changes):
+def test_gradients():
     """Forward = reverse = central differences in everything; k_t = 0.975 is where k_e = 1."""
-    point = TABLE_1 | changes | {"phi": phi, "at": 0.4, "P_y": 0.7, "P_z": -0.4}
-    point = {k: jnp.asarray(v) for k, v in point.items()}
+    for phi, changes in ((0.0, {}), (-1.9, {"k_t": 20.0, "EI": 1e3}), (0.0, {"k_t": 0.975})):
+        point = TABLE_1 | changes | {"phi": phi, "at": 0.4, "P_y": 0.7, "P_z": -0.4}
+        check_gradients({k: jnp.asarray(v) for k, v in point.items()})
+
+
+def check_gradients(point):
     ahead, back = forward(point), reverse(point)
     for name, v in point.items():
         step = 1e-5 * max(1.0, abs(float(v)))
@@ -304,13 +306,11 @@ def test_gradients(phi, changes):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("changes", [{"EI": math.inf}, {"k_t": math.inf}, {"phi": ALPHA}])
-def test_gradients_at_the_edges_are_finite(changes):
-    point = TABLE_1 | {"phi": 0.4, "at": 0.4, "P_y": 0.7, "P_z": -0.4} | changes
-    point = {k: jnp.asarray(v) for k, v in point.items()}
-    for of in (forward, reverse):
-        for name, slope in of(point).items():
-            assert np.all(np.isfinite(slope)), name
-    if "EI" in changes or changes.get("k_t") == math.inf:
-        name = next(iter(changes))
-        np.testing.assert_array_equal(forward(point)[name], 0)
+def test_gradients_at_the_edges_are_finite():
+    for name, value in (("EI", math.inf), ("k_t", math.inf), ("phi", ALPHA)):
+        point = TABLE_1 | {"phi": 0.4, "at": 0.4, "P_y": 0.7, "P_z": -0.4, name: value}
+        point = {k: jnp.asarray(v) for k, v in point.items()}
+        for of in (forward, reverse):
+            slopes = of(point)
+            assert all(np.all(np.isfinite(slope)) for slope in slopes.values())
+            assert name == "phi" or np.all(slopes[name] == 0)

@@ -29,7 +29,7 @@ from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
-from jaxtrachea.status import FitStatus, ProfileEnd
+from jaxtrachea.status import ProfileEnd
 from jaxtrachea.trachea.geometry import Geometry
 
 pytestmark = pytest.mark.compiling
@@ -139,28 +139,6 @@ def test_profile_is_the_refit_at_every_point(result):
         for end in (found.lower[k], found.upper[k]):
             there = 2 * (refit(curves, [(int(i), float(np.log(end)))])[1] - lowest)
             assert there == pytest.approx(CHI2, rel=1e-5)
-
-
-@pytest.mark.slow
-def test_joint_fit_is_dense_least_squares():
-    """Two specimens, one bed: estimates and standard errors of SciPy on all residuals at once."""
-    curves = [measured(1), measured(2, specimen="two", EI_C=24.0)]
-    study = study_of(sum(curves, []), {"bed_n": {"scope": "shared"}}, joint=True)
-    assert study.joint
-    result = fit(study, ONE)
-    assert np.all(result.status == FitStatus.CONVERGED)
-
-    def whole(x):
-        rows = [residual([x[k], x[2]], of_specimen) for k, of_specimen in enumerate(curves)]
-        return np.concatenate(rows)
-
-    start = np.log([31.0, 24.0, 0.013])
-    ends = {"xtol": 1e-12, "ftol": 1e-14}
-    found = least_squares(whole, start, "3-point", **ends)
-    se = np.sqrt(np.diagonal(np.linalg.inv(found.jac.T @ found.jac)))
-    np.testing.assert_allclose(result.theta, found.x[[[0, 2], [1, 2]]], atol=1e-6)
-    np.testing.assert_allclose(result.uncertainty.se, se[[[0, 2], [1, 2]]], rtol=1e-4)
-    np.testing.assert_allclose(np.sum(result.cost), found.cost, rtol=1e-8)
 
 
 @pytest.mark.slow

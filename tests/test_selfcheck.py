@@ -19,13 +19,8 @@ CASES, TRUTHS = table.read_cases(), table.read_truth()
 DOCUMENT = Path(__file__).parents[1] / "docs" / "evidence" / "hard_cases.md"
 #: Functions whose programs compile at once; the others are slow tests.
 QUICK = ("series", "quintic", "first_touch", "axial")
-#: Compiled without optimisation; the programs of the others are those of users.
-LARGE = ("oblique", "friction", "spheres", "boxes")
-EACH = [
-    pytest.param(f, marks=pytest.mark.compiling if f in LARGE else ())
-    for f in FUNCTIONS
-    if f not in QUICK
-]
+#: Their programs are those of users; the others are compiled without optimisation.
+OPTIMISED = ("vector", "press_9", "beam", "contacts")
 
 
 def wrong(outcomes):
@@ -38,10 +33,18 @@ def test_quick_functions():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("function", EACH)
-def test_function(function):
-    rows = [c for c in CASES if c.function == function]
+def test_optimised_functions():
+    rows = [c for c in CASES if c.function in OPTIMISED]
     assert not wrong(run_table(rows, TRUTHS, table.DTYPES))
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+@pytest.mark.parametrize("part", range(3))
+def test_other_functions(part):
+    others = [f for f in FUNCTIONS if f not in QUICK + OPTIMISED]
+    rows = [c for c in CASES if c.function in others[part::3]]
+    assert not wrong(run_table(rows, TRUTHS, table.DTYPES, unoptimised=True))
 
 
 def test_table_is_whole():

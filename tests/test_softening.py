@@ -122,7 +122,7 @@ def test_linear_limit():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("D", [3.0, -3.0, 0.0])
+@pytest.mark.parametrize("D", [3.0, 0.0])
 def test_derivatives(D):
     """Forward, reverse and second order against differences; `sensitivity` is the forward one."""
     args = [jnp.asarray(v) for v in (D, 0.8, 1.2, 0.1, 0.1127, 0.0061)]

@@ -68,8 +68,7 @@ def errors_of(got, exact):
 
 AGAINST_FEM = [
     (1e-9, True, "float64"),
-    (0.1, False, "float64"),
-    (0.1, True, "float32"),
+    (0.1, False, "float32"),
     (1e12, True, "float64"),
 ]
 
@@ -110,17 +109,16 @@ def test_against_fem(k, with_load, dtype):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("k", [1e-9, 1e9])
-def test_equal_rings_are_two_plane_beams(k):
+def test_equal_rings_are_two_plane_beams():
     """Diagonal and equal ring compliances: each plane is `beam.deflect`."""
     x, length, stiffness = 10.0 * np.arange(1, N + 1), 160.0, np.linspace(1, 3, N + 1)
     shear, load = np.linspace(2, 5, N + 1), 0.1 * np.sin(np.arange(N))
-    flat = one_plane.Beam(*cast("float64", x, length, stiffness, np.full(N, k), shear))
+    flat = one_plane.Beam(*cast("float64", x, length, stiffness, np.full(N, 1e9), shear))
 
     def pair(v):
         return np.stack([v, v], 1)
 
-    both = beam_of((x, length, pair(stiffness), np.eye(2) / k * np.ones((N, 1, 1)), pair(shear)))
+    both = beam_of((x, length, pair(stiffness), np.eye(2) / 1e9 * np.ones((N, 1, 1)), pair(shear)))
     single = jax.jit(
         lambda b, s, f, g: one_plane.deflect(b, s, f, ring_load=g), compiler_options=QUICK
     )
@@ -147,22 +145,6 @@ def test_planes_of_their_own():
     alone = jax.jit(one_plane.deflect)(flat, *cast("float64", 63.0, 1.0))
     np.testing.assert_array_equal(got.w[:, 1], 0)
     np.testing.assert_allclose(got.w[:, 0], alone.w, atol=1e-13)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-@pytest.mark.parametrize("k", [1e-3, 1e5])
-def test_reciprocity(k):
-    """Maxwell-Betti: motion at ring i for a load at C = motion of C for that load at ring i."""
-    rng = np.random.default_rng(3)
-    b, s = beam_of(tube(rng, k, spread=1.0, shear=True)), jnp.asarray(63.0)
-    unit = jnp.eye(2)
-    at_rings = jnp.stack([plain(b, s, e).w for e in unit], -1)
-    for i in (0, 6, 14):
-        for p in range(2):
-            load = jnp.zeros((N, 2)).at[i, p].set(1.0)
-            w_C = loaded(b, s, jnp.zeros(2), load).w_C
-            np.testing.assert_allclose(w_C, at_rings[i, p], atol=1e-12 * jnp.max(jnp.abs(at_rings)))
 
 
 @pytest.mark.parametrize("k", [1e-3, 0.1, 1e3])
@@ -270,15 +252,14 @@ reverse = jax.jit(jax.jacrev(_flat), compiler_options=QUICK)
 value = jax.jit(_flat, compiler_options=QUICK)
 
 
-@pytest.mark.parametrize("k", [1e-3, 0.1, 1e3])
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_gradients(k):
+def test_gradients():
     """Forward = reverse = central differences along a random direction of every argument."""
     s = 25.3
     rng = np.random.default_rng(9)
     n = 5
-    x, _, stiffness, C, shear = tube(rng, k, n=n, shear=True)
+    x, _, stiffness, C, shear = tube(rng, 0.1, n=n, shear=True)
     point = {"x": x, "length": 61.0, "EI": stiffness, "C": C, "GA": shear, "s": s}
     point |= {"integrity": np.linspace(0.2, 1, n), "force": np.array([0.4, -0.2])}
     point |= {"load": 0.1 * rng.normal(size=(n, 2))}

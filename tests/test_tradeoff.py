@@ -401,12 +401,9 @@ def test_a_wish_is_kept():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(("precision", "dtype"), [("auto", "float32"), ("float64", "float64")])
-def test_simulate_takes_the_plan_within_the_tolerance(
-    precision, dtype, tmp_path, monkeypatch, capsys
-):
+def test_simulate_takes_the_plan_within_the_tolerance(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    plan = f'[plan]\ntolerance = "10 %"\nprecision = "{precision}"\ncost = "operations"\n'
+    plan = '[plan]\ntolerance = "10 %"\ncost = "operations"\n'
     Path("scene.toml").write_text(TOML + plan)
     code, out, _ = run(monkeypatch, capsys, "simulate", "scene.toml", "--out", "result")
     assert code == 0
@@ -419,11 +416,9 @@ def test_simulate_takes_the_plan_within_the_tolerance(
     spec, made = staged(GA_L=None, k_1_ring=None)  # never knew of the two effects
     solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
     expected = solve(made.scene, made.material, made.path).force
-    assert force.dtype == dtype
-    assert json.loads(Path("result/provenance.json").read_text())["dtype"] == dtype
-    assert (level["precision"][0] if "precision" in level else "float64") == dtype
-    rtol = {"float32": 3e-6, "float64": 1e-9}[dtype]
-    np.testing.assert_allclose(force, expected, rtol=rtol, atol=1e-12)
+    assert json.loads(Path("result/provenance.json").read_text())["dtype"] == "float32"
+    assert force.dtype == level["precision"][0] == "float32"
+    np.testing.assert_allclose(force, expected, rtol=3e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("tolerance", ["0 %", "100 %", "1 mm"])

@@ -41,26 +41,17 @@ CLEAR = np.array([[300.0, 0.3, 2.0, 0.3]])
 HELD = {name: {"fixed": True, "value": 0.0} for name in ("onset", "force_offset")}
 
 
-def curves(pressed, count, share, rng, name="s", markers=False):
+def curves(pressed, count, share, rng, name="s"):
     """Noisy curves of the first `count` positions."""
     force = specimens.noisy(pressed.force[:, :count], share, rng)
-    joints = specimens.noisy(pressed.joints[:, :count], share, rng)
     for i in range(len(force)):
         for t in range(count):
-            curve = Curve(
-                f"{name}{i:03d}", f"t{t}", POSITIONS[t], 0.0, specimens.DEPTHS, force[i, t]
-            )
-            if markers:
-                every = np.arange(len(RINGS))
-                curve = dataclasses.replace(
-                    curve, joint_rings=every, joint_displacement=joints[i, t]
-                )
-            yield curve
+            yield Curve(f"{name}{i:03d}", f"t{t}", POSITIONS[t], 0.0, specimens.DEPTHS, force[i, t])
 
 
-def make_study(data, markers=False):
+def make_study(data):
     """A study with the defaults of the package."""
-    parameters = default_parameters(in_model(OPTIONS, joints=markers), HELD)
+    parameters = default_parameters(in_model(OPTIONS, joints=False), HELD)
     return build_study(list(data), GEOMETRY, OPTIONS, parameters)
 
 
@@ -255,19 +246,18 @@ def test_no_doubt_costs_nothing(study, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("markers", [False, True], ids=["forces", "markers"])
-@pytest.mark.parametrize("count", [1, 2])
-def test_truth_table(count, markers):
+@pytest.mark.compiling
+def test_truth_table():
     """100 specimens at 0.2 and 2 % noise: at most 5 % have an unknown falsely identifiable.
 
-    False: identifiable, more than 10 % off and outside the interval of 99.7 %. Truths and noise
-    are not those that the thresholds were chosen with (seeds 100 and 107).
+    Of two presses. False: identifiable, more than 10 % off and outside the interval of 99.7 %.
+    Truths and noise are not those that the thresholds were chosen with (seeds 100 and 107).
     """
-    pressed = specimens.press(specimens.draw(2024, 100), RINGS, LENGTH, POSITIONS[:count])
+    pressed = specimens.press(specimens.draw(2024, 100), RINGS, LENGTH, POSITIONS[:2])
     rng = np.random.default_rng(2025)
     data = [c for share, name in ((0.002, "a"), (0.02, "b"))
-            for c in curves(pressed, count, share, rng, name, markers)]  # fmt: skip
-    found = fit(make_study(data, markers))
+            for c in curves(pressed, 2, share, rng, name)]  # fmt: skip
+    found = fit(make_study(data))
     assert found.succeeded.all()
     word, _, false = verdicts(found, np.tile(pressed.truth, (2, 1)))
     identifiable = word == "identifiable"
@@ -292,20 +282,18 @@ def joint_study(seed, shared, count, share):
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
-    ("seeds", "shared", "count"), [((1,), ("EI_L",), 2), (range(12), ("k_1", "k_3"), 2)]
+    ("seeds", "shared", "count"), [((1,), ("EI_L",), 2), (range(4), ("k_1", "k_3"), 2)]
 )
 def test_a_joint_fit_says_what_it_has_not_looked_at(seeds, shared, count):
     """No wrong unknown is identifiable; with local errors alone 7 of 8, 30 of 53, 9 of 21 were.
 
-    All come to rest, also where an unknown is best at infinity (seed 2 had stalled); but for one
-    that creeps along a valley for 200 iterations, and says so.
+    All come to rest, also where an unknown is best at infinity (seed 2 had stalled).
     """
     words = []
     for seed in seeds:
         study, truth = joint_study(seed, shared, count, 0.002)
         result = fit(study, Settings(starts=4))
-        creeps = seed == 10 and shared == ("k_1", "k_3")
-        assert creeps or np.all(result.status <= FitStatus.UNIDENTIFIABLE), seed
+        assert np.all(result.status <= FitStatus.UNIDENTIFIABLE), seed
         word, _, false = verdicts(result, truth)
         assert not np.any(false & (word == "identifiable")), seed
         words.append(word)

@@ -137,11 +137,11 @@ def cloud(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
     Raises:
         ValueError: not an (n, 3) array, or a radius below zero.
     """
-    vertices = jnp.asarray(points, dtype)
+    vertices = _on_host(jnp.asarray(points, dtype))
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.shape[0] == 0:
         raise ValueError(f"points: expected shape (n, 3) with n >= 1, found {vertices.shape}")
     if not isinstance(vertices, Tracer):
-        _, first = np.unique(np.asarray(vertices) + 0.0, axis=0, return_index=True)
+        _, first = np.unique(vertices + 0.0, axis=0, return_index=True)
         vertices = vertices[np.sort(first)]
     return _shape(vertices.T, radius)
 
@@ -188,7 +188,7 @@ def sphere(radius: ArrayLike, dtype=None) -> Shape:
         dtype: of the shape; default JAX's default.
     """
     r = jnp.asarray(radius, dtype)
-    return _shape(jnp.zeros((3, 1), jnp.result_type(r, float) if dtype is None else dtype), r)
+    return _shape(np.zeros((3, 1), jnp.result_type(r, float) if dtype is None else dtype), r)
 
 
 def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
@@ -200,10 +200,8 @@ def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
         dtype: of the shape; default that of `half_length`.
     """
     half = jnp.asarray(half_length, dtype)
-    half = jnp.asarray(half, jnp.result_type(half, float) if dtype is None else dtype)
-    end = jnp.stack([-half, half])
-    zero = jnp.zeros_like(end)
-    return _shape(jnp.stack([zero, zero, end]), radius)
+    half = _on_host(jnp.asarray(half, jnp.result_type(half, float) if dtype is None else dtype))
+    return _shape(half * np.array([[0, 0], [0, 0], [-1, 1]], half.dtype), radius)
 
 
 def box(half_sizes: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
@@ -215,9 +213,9 @@ def box(half_sizes: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
             of the normal reach beta times the size: round what you differentiate.
         dtype: of the shape; default that of `half_sizes`.
     """
-    half = jnp.asarray(half_sizes, dtype)
+    half = _on_host(jnp.asarray(half_sizes, dtype))
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)
-    return _shape(half[:, None] * jnp.asarray(signs, half.dtype), radius)
+    return _shape(half[:, None] * signs.astype(half.dtype), radius)
 
 
 def cylinder(
@@ -245,11 +243,12 @@ def cylinder(
     """
     if sides < 3:
         raise ValueError(f"sides: expected at least 3, found {sides}")
-    r = jnp.asarray(disc_radius, dtype)
-    turn = 2 * math.pi / sides * np.arange(sides)
-    x, y = (jnp.tile(r * jnp.asarray(f(turn), r.dtype), 2) for f in (np.cos, np.sin))
-    z = jnp.repeat(jnp.asarray(half_length, r.dtype) * jnp.array([-1.0, 1.0], r.dtype), sides)
-    return _shape(jnp.stack([x, y, z]), radius)
+    r = _on_host(jnp.asarray(disc_radius, dtype))
+    half = _on_host(jnp.asarray(half_length, r.dtype))
+    turn, none = 2 * math.pi / sides * np.tile(np.arange(sides), 2), np.zeros(2 * sides)
+    across = np.stack([np.cos(turn), np.sin(turn), none]).astype(r.dtype)
+    along = np.stack([none, none, np.repeat([-1.0, 1.0], sides)]).astype(r.dtype)
+    return _shape(r * across + half * along, radius)
 
 
 def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Shape:
@@ -286,14 +285,22 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
     most = max(part.vertices.shape[1] for part in found)
     if any(part.vertices.shape[1] < most or part.counts is not None for part in found):
         found = [padded(part, most) for part in found]
-    return jax.tree.map(lambda *v: jnp.stack(v), *found)
+
+    def stacked(*parts):
+        traced = any(isinstance(v, Tracer) for v in parts)
+        return jnp.stack(parts) if traced else jnp.asarray(np.stack(parts))
+
+    return jax.tree.map(stacked, *found)
 
 
 def parts_of(shape: Shape) -> list[Shape]:
     """The convex parts of a tool, each with its own vertices: itself, if it has no others."""
     if shape.vertices.ndim == 2:
         return [shape]
-    parts = [jax.tree.map(lambda v, i=i: v[i], shape) for i in range(len(shape.radius))]
+    parts = [
+        jax.tree.map(lambda v, i=i: jnp.asarray(_on_host(v)[i]), shape)
+        for i in range(len(shape.radius))
+    ]
     return [_unpadded(part) for part in parts]
 
 
@@ -301,7 +308,8 @@ def _unpadded(shape: Shape) -> Shape:
     """Without the vertices that do not count, where that is known."""
     if shape.counts is None or isinstance(shape.counts, Tracer):
         return shape
-    return Shape(shape.vertices[:, np.asarray(shape.counts) > 0], shape.radius)
+    kept = _on_host(shape.vertices)[:, np.asarray(shape.counts) > 0]
+    return Shape(jnp.asarray(kept), shape.radius)
 
 
 def _moved(shape: Shape, pose: Pose) -> Shape:
@@ -324,13 +332,21 @@ def padded(shape: Shape, count: int) -> Shape:
     present = shape.vertices.shape[1]
     if count < present:
         raise ValueError(f"count: expected at least {present} (the vertices), found {count}")
-    own = jnp.ones(present, shape.vertices.dtype) if shape.counts is None else shape.counts
-    counts = jnp.concatenate([own, jnp.zeros(count - present, own.dtype)])
-    return Shape(shape.vertices[:, np.arange(count) % present], shape.radius, counts)
+    again = np.arange(count)
+    counts = np.ones(present) if shape.counts is None else _on_host(shape.counts)
+    counts = counts[again % present] * (again < present)
+    vertices = _on_host(shape.vertices)[:, again % present]
+    return Shape(jnp.asarray(vertices), shape.radius, jnp.asarray(counts, vertices.dtype))
+
+
+def _on_host(value):
+    """In NumPy, where it is not traced: in JAX each operation would be a program of its own."""
+    return value if isinstance(value, Tracer) else np.asarray(value)
 
 
 def _shape(vertices, radius) -> Shape:
     """Common dtype and the check of the radius, where it is a number."""
+    vertices = jnp.asarray(vertices)
     r = jnp.asarray(radius, vertices.dtype)
     if not isinstance(r, Tracer) and np.any(np.asarray(r) < 0):
         raise ValueError(f"radius: expected a length not below 0, found {radius}")

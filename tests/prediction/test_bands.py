@@ -49,17 +49,16 @@ def check_coverage(read, noise):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [NOISE, 0.15])
-def test_bands_cover_in_2000_fits(noise, tmp_path):
-    """Truth from finite elements; parameters known to 1 to 3 % and to 10 to 24 %."""
-    noisy_study(tmp_path, noise, 2000, 70)
-    check_coverage(jaxtrachea.read_results(tmp_path), noise)
+@pytest.mark.compiling
+def test_bands_cover_in_2000_fits(tmp_path):
+    """Truth from finite elements; parameters known to 10 to 24 %."""
+    noisy_study(tmp_path, 0.15, 2000, 70)
+    check_coverage(jaxtrachea.read_results(tmp_path), 0.15)
 
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("free", [True, False])
-def test_residuals_and_bands_of_unequal_noise(free, tmp_path):
+def test_residuals_and_bands_of_unequal_noise(tmp_path):
     """Sizes of residuals are in N and mm, bands of markers as wide as their own noise is."""
     measured = jaxtrachea.read_measurements(VIRTUAL / "small_strain.h5").curves[:2]
     weighed = [dataclasses.replace(c, sigma=0.01 * np.arange(1.0, len(c.force) + 1))
@@ -68,8 +67,7 @@ def test_residuals_and_bands_of_unequal_noise(free, tmp_path):
     values = {"k_3": 0.0, "EI_L": 300.0, "k_M": 1.0, "GA_L": 9.0}
     held = {name: {"fixed": True, "value": value} for name, value in values.items()}
     options = Options(contact="bonded", shear=True)
-    changes = held | {"k_1": {} if free else {"fixed": True, "value": 2.0}}
-    result = fit(build_study(weighed, table_1(), options, changes, noise=noise), TWO)
+    result = fit(build_study(weighed, table_1(), options, held | {"k_1": {}}, noise=noise), TWO)
     write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
     read = jaxtrachea.read_results(tmp_path / "r.h5")
     off, aside = [], []

@@ -257,11 +257,10 @@ def late_study(onset, offset, late=(10.0, 10.3), zero=0.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("onset", [{}, {"fixed": True, "value": 10.0}])
-def test_extrapolated_and_tested_are_depths_from_first_touch(onset, tmp_path):
+def test_extrapolated_and_tested_are_depths_from_first_touch(tmp_path):
     """Presses of 1 mm, recorded from 8 to 11 mm; what was said was held against these 11 mm."""
-    late = (10.0, 10.0 if onset else 10.3)
-    result = fit(late_study(onset, {}, late), Settings(starts=1, verify=False))
+    late = (10.0, 10.3)
+    result = fit(late_study({}, {}, late), Settings(starts=1, verify=False))
     write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
     beyond = "extrapolated from data at D = 0 to 1 mm from first touch"
     for results in (result, jaxtrachea.read_results(tmp_path / "r.h5")):
@@ -277,10 +276,9 @@ def test_extrapolated_and_tested_are_depths_from_first_touch(onset, tmp_path):
             assert beyond in said(trial, 1.02)
             assert "tested" not in said(trial, 1.02)
             assert "the model was tested to D = 1.13 mm from first touch" in said(trial, 1.2)
-    if not onset:  # a new press begins at its touch
-        new = jaxtrachea.predict(result, s=61.0, displacement=11.0)
-        assert beyond in new.message
-        assert "the model was tested to D = 1.13 mm from first touch" in new.message
+    new = jaxtrachea.predict(result, s=61.0, displacement=11.0)  # it begins at its touch
+    assert beyond in new.message
+    assert "the model was tested to D = 1.13 mm from first touch" in new.message
 
 
 def recorded_study(scope):
@@ -314,10 +312,7 @@ def law_error(scope, D):
     return np.sqrt(np.einsum("in,ij,jn->n", x, covariance, x))
 
 
-@pytest.mark.parametrize(
-    "scope",
-    ["specimen", *late("fixed", "shared", "trial")],
-)
+@pytest.mark.parametrize("scope", ["specimen", *late("trial")])
 def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_path):
     """Closed form. A zero that is held, or of a specimen, was taken for that of the new press."""
     read = stored_again(recorded_study(scope), tmp_path / "r.h5")

@@ -153,27 +153,6 @@ def test_the_energy_by_the_place_is_that_of_the_work():
 
 
 @pytest.mark.slow
-def test_closed_loops_of_a_tool_that_wanders_do_no_work():
-    """On the midline, up and down along the tube; the trapezoidal rule errs by its square."""
-    effects = dataclasses.replace(BARE, contact_point="per_step")
-    start = ball([75, 1, 0], [75, -3, 0])
-    scene = make_scene(TUBE, SOFT, start, tool=BALL, effects=effects)
-    assert (scene.plan.second_plane, scene.plan.level("skeleton")) == (False, "softening")
-    found = []
-    for steps in (128, 512):
-        t = np.linspace(0, 2 * np.pi, steps + 1)
-        way = np.stack([74 + 6 * np.cos(t), OUTER + 5 - 2.5 + 1.5 * np.sin(t), 0 * t], 1)
-        rotation = np.broadcast_to(np.eye(3), (steps + 1, 3, 3))
-        out = run(scene, SOFT, Poses(rotation, way))
-        assert (np.asarray(out.status) == OK).all()
-        F = np.asarray(out.force)
-        part = np.sum((F[1:] + F[:-1]) / 2 * np.diff(way, axis=0), axis=1)
-        found.append(abs(part.sum()) / np.maximum(part, 0).sum())
-    assert found[1] < found[0] / 10
-    assert found[1] < 1e-4
-
-
-@pytest.mark.slow
 def test_derivatives_and_lanes():
     """Forward = reverse = differences by material and displacement; `vmap` over e_1."""
     path = down([1.0, 4.0], 73.3)

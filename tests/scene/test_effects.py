@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scenes import BALL, BARE, MATERIAL, SPRINGS, TUBE, ball, poses
+from small_scenes import BALL, BARE, MATERIAL, SPRINGS, TUBE, poses
 
 from jaxtrachea import Poses, make_scene, simulate, sweep
 from jaxtrachea.scene.declare import RELAXES, RELAXES_APART, SceneFacts
@@ -137,16 +137,3 @@ def test_a_bad_material_is_one_in_simulate_and_in_sweep():
     out = swept(scene, MATERIAL, places, np.zeros(3), depth)
     off = PressStatus.OFF_PLAN
     assert out.status.tolist() == [off, PressStatus.NO_CONTACT, off]
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_behind_the_rings_or_without_a_number_a_row_is_not_off_the_plan():
-    """Of two reasons the same one is named as in `simulate`."""
-    path = ball([75, 1, 0], [75, -2, 0], 2)
-    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
-    at = np.array([[75.0, np.nan, 500.0], [3.0, 0.0, 0.0], [2.0] * 3])
-    out = swept(scene, MATERIAL, *at)
-    assert out.status.tolist() == [
-        PressStatus.BEHIND_GAP, PressStatus.NON_FINITE, PressStatus.OFF_PLAN
-    ]  # fmt: skip

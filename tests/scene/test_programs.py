@@ -44,12 +44,10 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
 
-HELD, TOTAL = Options(contact="bonded"), Options(coupling="total")
 
-
-def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **how):  # noqa: B008
+def by_hand(more="joints loads end_U end_V", surface=False, **how):
     """A program for presses at one contact point."""
-    oblique = ObliqueOptions(options, **how)
+    oblique = ObliqueOptions(**how)
 
     def run(scene, m, p):
         m, led, used, status, hidden = admitted(scene, m, p)
@@ -60,7 +58,7 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
             return press_oblique(scene.geometry, m, *at, used.displacement, oblique)
 
         out = fuse(pressed)(used)
-        vertices = move_surface(scene, *at, out, surface) if surface else ()
+        vertices = move_surface(scene, *at, out) if surface else ()
         named = {name: getattr(out, name) for name in ("force", "depth", "skeleton", *more.split())}
         named, vertices = hidden((named, vertices))
         return led, named, vertices, status(out._replace(**named))
@@ -81,20 +79,18 @@ def admitted(scene, m, p, made=None):
     return m, presses.displacement, used, status, hidden
 
 
-def move_surface(scene, s, phi, out, kind):
+def move_surface(scene, s, phi, out):
     mesh = scene.mesh
     weights = regions.weigh(scene.binding, phi)
-    if kind == "with a dent":
-        straight = mesh.straight
-        where = local.centres(s, phi, scene.radius, scene.footprint, 8)
+    straight = mesh.straight
+    where = local.centres(s, phi, scene.radius, scene.footprint, 8)
 
     def one(skeleton, joints, U, V, slopes, slope_C, depth):
         keys = regions.clamped(s, skeleton, joints, U, V, slopes, slope_C)
         u = regions.interpolate(scene.binding, weights, keys)
-        if kind == "with a dent":
-            share = local.shares(depth, jnp.zeros(8))[:, None]
-            dent = local.fit(where, share, 3 * scene.footprint, depth)
-            u = local.add_correction(u, dent, straight, scene.runs, s)
+        share = local.shares(depth, jnp.zeros(8))[:, None]
+        dent = local.fit(where, share, 3 * scene.footprint, depth)
+        u = local.add_correction(u, dent, straight, scene.runs, s)
         return place(mesh, u)
 
     rows = out.skeleton, out.joints, out.end_U, out.end_V, out.slopes, out.slope_C, out.depth
@@ -198,17 +194,12 @@ MAT = {"rings": "mat"}
 #: name -> (path, effects, program by hand)
 PROGRAMS = {
     "normal": (DOWN, {**ONE, **MAT}, normal),
-    "oblique": (OBLIQUE, {**BARE, **MAT}, by_hand(**MAT)),
     "force only": (OBLIQUE, {**ONE, **MAT}, by_hand(more="", **MAT)),
-    "bonded": (OBLIQUE, {**BARE, **MAT, "contact": "bonded"}, by_hand(HELD, **MAT)),
-    "total": (OBLIQUE, {**BARE, **MAT, "coupling": "total"}, by_hand(TOTAL, **MAT)),
-    "no axial": (OBLIQUE, {**BARE, **MAT, "axial": "off"}, by_hand(axial=False, **MAT)),
     "off the midline": (OFF, BARE, by_hand(rings="arch2", axial=False)),
     "friction": (OBLIQUE, {**BARE, **MAT}, friction),
     "many places": (MANY, {**BARE, **MAT, "axial": "off"}, each),
     "tool": (LED, {**BARE, **MAT}, tool),
-    "surface": (OBLIQUE, {**SKIN, **MAT, "dent": "off"}, by_hand(more="", surface="global", **MAT)),
-    "dent": (OBLIQUE, {**SKIN, **MAT}, by_hand(more="", surface="with a dent", **MAT)),
+    "surface": (OBLIQUE, {**SKIN, **MAT}, by_hand(more="", surface=True, **MAT)),
 }
 
 

@@ -382,19 +382,6 @@ def test_a_lost_pose_leaves_the_others_as_they_are(through):
 
 
 @pytest.mark.slow
-def test_steps_keep_their_side_of_the_wall():
-    contact_point = "fixed"
-    effects = dataclasses.replace(ONE, contact_point=contact_point)
-    scene = make_scene(TUBE, SPRINGS, upright(19, 16), tool=BALL, effects=effects)
-    session = Session(scene, SPRINGS)
-    for heights, expected in WAYS.values():
-        session.reset()
-        assert [int(session.step(np.eye(3), [75.0, y, 0.0]).status) for y in heights] == expected
-        paths = run(scene, SPRINGS, upright(*heights))
-        assert paths.status.tolist()[: len(expected)] == expected
-
-
-@pytest.mark.slow
 def test_a_tool_in_the_lumen_of_a_mesh_has_no_force():
     """Patches are closed: the gap was that to a face across the tube, or behind the rings.
 

@@ -119,29 +119,6 @@ def test_against_finite_elements_off_the_midline():
 
 
 @pytest.mark.slow
-def test_derivatives_are_those_of_the_equilibrium():
-    """By the material and the way: forward = reverse = differences of fourth order."""
-    path = straight([75.0, 70.0], [0.5, 1.2], 3.0)
-
-    def values(x):
-        material = dataclasses.replace(WALL, EI_C=WALL.EI_C * x[0], c_W=WALL.c_W * x[1])
-        out = simulate(ANYWHERE, material, Presses(path.s, path.phi, path.displacement * x[2]))
-        return jnp.concatenate([out.force.ravel(), out.end_U[:, 7].ravel()])
-
-    x = jnp.ones(3)
-    ahead = jax.jit(lambda x, v: jax.jvp(values, (x,), (v,)))  # value and slope: one program
-    back = jax.jit(lambda x, w: jax.vjp(values, x)[1](w)[0])  # of one result
-    forward = np.stack([ahead(x, v)[1] for v in jnp.eye(3)], 1)
-    reverse = np.stack([back(x, w) for w in jnp.eye(len(forward))])
-    np.testing.assert_allclose(forward, reverse, atol=1e-10)
-    h = 1e-3
-    for i, e in enumerate(jnp.eye(3)):
-        near = [ahead(x + k * h * e, e)[0] for k in (1, -1, 2, -2)]
-        difference = (8 * (near[0] - near[1]) - (near[2] - near[3])) / (12 * h)
-        np.testing.assert_allclose(forward[:, i], difference, atol=1e-7)
-
-
-@pytest.mark.slow
 def test_a_sweep_goes_round_the_rings():
     s, phi, depth = [75.0, 75.0, 70.0, 75.0, 75.0], [0.6, -0.6, 0.0, 3.0, 0.2], [2.0, 2, 2, 2, 0]
     out = jax.jit(sweep)(ANYWHERE, WALL, s, phi, depth)

@@ -136,9 +136,9 @@ def test_modes_without_compliance_of_their_own(m):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(("m", "symmetric"), [(7, False), (14, True)])
-def test_derivative_is_that_of_an_inverse(symmetric, m):
+def test_derivative_is_that_of_an_inverse():
     """-X dA X forward, -X^T c X^T reverse; for symmetric changes of symmetric matrices."""
+    m, symmetric = 14, True
     rng = np.random.default_rng(m)
     A, dA, c = (spectra(rng, m, 1e2)[0] for _ in range(3))
     X = np.linalg.inv(A)

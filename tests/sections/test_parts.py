@@ -56,10 +56,10 @@ def random_blocks(n, m, indefinite):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("n", [2, 9])
-@pytest.mark.parametrize("indefinite", [False, True])
-@pytest.mark.parametrize(("m", "alone"), [(7, True), (14, False)])
-def test_block_elimination_is_dense(m, alone, indefinite, n):
+@pytest.mark.parametrize(
+    ("n", "m", "alone", "indefinite"), [(9, 7, True, True), (2, 14, False, False)]
+)
+def test_block_elimination_is_dense(n, m, alone, indefinite):
     """As single kernels or not; also of many lanes, whose products are the library's."""
     D, U, dense = random_blocks(n, m, indefinite)
     if not indefinite:

@@ -131,17 +131,6 @@ def test_the_midline_program_is_the_other_one():
 
 
 @pytest.mark.slow
-def test_mirror_images():
-    """What is at +phi is at -phi with z turned; so are the two ends of a symmetric tube."""
-    left, right, far = press([({}, 22.0, 0.8, PATH), ({}, 22.0, -0.8, PATH), ({}, 48.0, 0.8, PATH)])
-    mirror = np.array([1, 1, -1])
-    np.testing.assert_allclose(left.force, right.force * mirror, atol=1e-11)
-    np.testing.assert_allclose(left.end_U, right.end_V * mirror, atol=1e-10)
-    np.testing.assert_allclose(left.force, far.force, atol=1e-10)
-    np.testing.assert_allclose(left.joints, far.joints[:, ::-1] * [-1, 1, 1], atol=1e-10)
-
-
-@pytest.mark.slow
 @pytest.mark.compiling
 def test_continuous_where_the_contact_crosses_a_ring_or_mid_span():
     places = [29.999, 30.0, 30.001, 34.999, 35.0, 35.001]

@@ -10,7 +10,6 @@ import pytest
 
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import press_sections
-from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 from .test_press import VALUES
@@ -86,19 +85,3 @@ def test_second_derivatives():
     by_hand = [(slope(x + h * v, v)[0] - slope(x - h * v, v)[0]) / (2 * h) for v in unit]
     np.testing.assert_allclose(hessian, by_hand, atol=1e-6)
     np.testing.assert_allclose(hessian, hessian.T, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_bad_row_does_not_touch_the_derivatives_of_others():
-    def total(k_n):
-        def one(k_n, s_c):
-            material = SectionMaterial(**(VALUES | {"bed_n": k_n}))
-            return press_sections(GEOMETRY, material, s_c, 0.4, jnp.asarray([1.0, 2.0]))
-
-        got = jax.vmap(one)(k_n, jnp.asarray([17.0, 99.0, 17.0]))
-        good = got.status == PressStatus.OK
-        return jnp.sum(jnp.where(good, got.force[..., 1], 0))
-
-    slope = jax.jit(jax.grad(total))(jnp.asarray([0.02, 0.02, -1.0]))
-    assert slope[0] != 0
-    np.testing.assert_array_equal(slope[1:], 0)
