@@ -15,7 +15,6 @@ from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out, without
 from jaxtrachea.inference.design.candidates import Candidates, check
 from jaxtrachea.inference.design.choice import gains

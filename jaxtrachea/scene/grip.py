@@ -32,10 +32,12 @@ class Slip(NamedTuple):
     Attributes:
         held: on the place that it holds; shape (2,).
         before: on the places before; shape (2,).
+        stored: elastic energy of the press, N mm.
     """
 
     held: Float[Array, "2"]
     before: Float[Array, "2"]
+    stored: Float[Array, ""]
 
 
 class Grip(NamedTuple):

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import product
 from jaxtrachea.mechanics.friction import Coulomb
-from jaxtrachea.mechanics.oblique import slide_at
+from jaxtrachea.mechanics.oblique import Place, energy_at, slide_at, stored_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import (
     MAX_MISMATCH,
@@ -47,7 +47,7 @@ from jaxtrachea.trachea.material import Material
 
 def no_slip(dtype) -> Slip:
     """Before the first touch."""
-    return Slip(jnp.zeros(2, dtype), jnp.zeros(2, dtype))
+    return Slip(jnp.zeros(2, dtype), jnp.zeros(2, dtype), jnp.zeros((), dtype))
 
 
 def rub(
@@ -65,13 +65,13 @@ def rub(
     followed = pick(follows, followed, state.anchor)
     now = anchor_at(scene, here)
     anchor = pick(teleported, now, pick(on, followed, first))
-    way = press_vector(scene, anchor, here.path)
+    led = press_vector(scene, anchor, here.path)
     mismatch = MAX_MISMATCH * jnp.where(hit, depth, jnp.inf)
-    inward = jnp.clip(way[0], depth - mismatch, depth + mismatch)
+    inward = jnp.clip(led[0], depth - mismatch, depth + mismatch)
     rolled = now.body - anchor.body
     share = 1 - limit(jnp.where(hit, depth, 0), length(rolled))
     inward = inward + share * (depth - inward)
-    way = jnp.concatenate([inward[None], way[1:]])
+    way = jnp.concatenate([inward[None], led[1:]])
     slip = pick(on, _behind(scene, state, followed), no_slip(way.dtype))
     slip = _within(slip, way[1:], most)
     place = place_of(scene, material, anchor)
@@ -79,7 +79,12 @@ def rub(
     frame = local_frame(anchor.phi)
     coulomb = Coulomb(scene.friction)
     path, slid = slide_at(place, product(frame.T, way), coulomb, scene.plan.oblique)
-    total = slip._replace(held=slip.held + slid)
+    # The press before this step, on the place and with the depth that it has now.
+    before = press_vector(scene, anchor, last.path) + way - led
+    changed = on & (follows | (inward != led[0]))
+    given_up = _energy_lost(scene, state.slip, place, jnp.where(changed, before, 0))
+    given_up = jnp.where(changed, given_up, 0)
+    total = slip._replace(held=slip.held + slid, stored=energy_at(place, path.press)[0])
     nothing = jnp.zeros(1, way.dtype)
     held = anchor._replace(body=anchor.body + share * rolled)
 
@@ -87,7 +92,7 @@ def rub(
         refused = jnp.isnan(jnp.sum(presses.displacement, axis=1))
         moved = moved_by(path.press, scene.plan)
         slip = product(total.held, frame[1:])[None]
-        numbers = moved._replace(slip=slip, dissipated=path.dissipated, status=None)
+        numbers = moved._replace(slip=slip, dissipated=path.dissipated + given_up, status=None)
         return mask_rows(refused, numbers)._replace(status=moved.status)
 
     return Grip(
@@ -99,6 +104,13 @@ def rub(
         slip=total,
         total=product(total.held + total.before, frame[1:]),
     )
+
+
+def _energy_lost(scene: Scene, slip: Slip, place: Place, way: Float[Array, "3"]):
+    """What the press stored in the step before, and does not on this place, N mm."""
+    there = stored_at(place, product(local_frame(place.phi_c).T, way), scene.plan.oblique)
+    lost = slip.stored - there
+    return jnp.where(jnp.isfinite(lost), lost, 0)
 
 
 def _behind(scene: Scene, state: Any, followed: Anchor) -> Slip:
@@ -115,4 +127,4 @@ def _within(slip: Slip, way: Float[Array, "2"], most: Float[Array, ""]) -> Slip:
 
 
 def _left(slip: Slip, way: Float[Array, "2"]) -> Slip:
-    return Slip(slip.held - way, slip.before + way)
+    return slip._replace(held=slip.held - way, before=slip.before + way)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxtrachea.contact import shapes
 from jaxtrachea.trachea.cleaning import Surface, labels
@@ -16,6 +16,8 @@ from jaxtrachea.units import UnitError, unit_factor
 HOLLOW = 0.01
 #: Share of the size of an object within which corners are one.
 WELDED = 1e-7
+#: Triangles at one edge this near to each other, rad, lie on one another.
+SAME_TURN = 1e-6
 #: Share of its hull that a closed body may leave empty.
 EMPTY = 0.1
 #: Corners of a convex part at most: the cost of a contact grows with them.
@@ -27,8 +29,8 @@ COARSEST = 0.01
 def read_tool(path: Path, unit: str | None, rounding: float) -> tuple[shapes.Shape, str]:
     """A tool about the origin of its file, one convex body or several, and a note on its size.
 
-    Several bodies are the objects of the file, and what of one hangs together by its corners; they
-    may touch each other or overlap.
+    Several bodies are the objects of the file, and what of one hangs together by its edges; they
+    may touch each other, share a face, or overlap.
 
     Args:
         path: STL, OBJ, PLY, GLB and what else trimesh reads.
@@ -92,14 +94,44 @@ def _welded(surface: Surface) -> Surface:
 
 
 def _pieces(surface: Surface) -> list[Surface]:
-    """What hangs together by its corners."""
+    """What hangs together by its edges; bodies that share a face or an edge are apart."""
     vertices, faces = surface
-    piece = labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(vertices))[faces[:, 0]]
+    piece = labels(_neighbours(vertices, faces), len(faces))
     found = []
     for label in np.unique(piece):
         used, own = np.unique(faces[piece == label], return_inverse=True)
         found.append(Surface(vertices[used], own.reshape(-1, 3)))
     return found
+
+
+def _neighbours(vertices, faces) -> Int[np.ndarray, "pairs 2"]:
+    """Triangles that go on in each other at an edge, by their numbers."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    same = unique_rows(np.sort(edges, axis=1))[1]
+    order = np.argsort(same, kind="stable")
+    found = [np.zeros((0, 2), int)]
+    for at in np.split(order, np.flatnonzero(np.diff(same[order])) + 1):
+        pairs = at[None] if len(at) == 2 else _across(vertices, faces, edges, at)
+        found.append(np.asarray(pairs) // 3)
+    return np.concatenate(found)
+
+
+def _across(vertices, faces, edges, at):
+    """Pairs of the sides `at` of an edge of several bodies: those with a body's inside between.
+
+    Triangles turn their fronts outwards, so that the inside of one that runs up the edge is
+    clockwise of it. All are paired where as many do not run down as up: no closed bodies.
+    """
+    low, high = np.sort(edges[at[0]])
+    up = edges[at, 0] == low
+    if up.sum() != (~up).sum():
+        return np.stack([at[:-1], at[1:]], axis=1)
+    along = vertices[high] - vertices[low]
+    third = faces[at // 3].sum(axis=1) - edges[at].sum(axis=1)
+    out = np.cross(along, vertices[third] - vertices[low])
+    turn = np.arctan2(np.cross(out[0], out) @ along / np.linalg.norm(along), out @ out[0])
+    inside = (turn[up][:, None] - turn[~up][None] - SAME_TURN) % (2 * np.pi)
+    return np.stack([at[up], at[~up][np.argmin(inside, axis=1)]], axis=1)
 
 
 def _closed(body: Surface) -> bool:

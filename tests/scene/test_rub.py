@@ -133,8 +133,7 @@ def test_a_hand_that_wanders(session):
     assert 25 < found.slip[:, 0].max() < 30
     lost = found.dissipated.sum()
     assert lost > 2
-    # The place moves without a force of its own: what it stored elsewhere is not given back.
-    np.testing.assert_allclose(work(found, centres).sum(), lost, rtol=0.05)
+    np.testing.assert_allclose(work(found, centres).sum(), lost, rtol=2e-3)
 
 
 def small_loop(seed, steps, aside=0.03):
@@ -148,35 +147,36 @@ def small_loop(seed, steps, aside=0.03):
     return placed(way, OUTER)
 
 
-def lost_besides(session, centres):
-    """Work that did not go into friction, over all that was done to and fro."""
-    found = led(session, centres)
-    assert found.gap[0] > 0 > found.gap.min()
-    assert (found.dissipated >= 0).all()
-    done = work(found, centres)
-    assert done.sum() > 0
-    return (done.sum() - found.dissipated.sum()) / np.abs(done).sum()
+def check_loops(session, ways, bound):
+    """All work of the hand is `dissipated`, but for the first power of the step.
 
-
-def check_loops(session, count, steps, rounding):
-    """On the midline only the trapezoidal rule is in between.
-
-    Beside it the press gives way where it differs from the depth of the tool, which may take and
-    give a little.
+    Where the place gives way it may also take up energy: next to nothing.
     """
-    for seed in range(count):
-        assert abs(lost_besides(session, small_loop(seed, steps, 0))) < rounding
-        assert -0.02 < lost_besides(session, small_loop(seed, steps)) < 0.05
+    for centres in ways:
+        found = led(session, centres)
+        assert found.gap[0] > 0 > found.gap.min()
+        done, lost = work(found, centres), found.dissipated
+        size = np.abs(done).sum()
+        assert done.sum() > 0
+        assert abs(done.sum() - lost.sum()) < bound * size
+        assert lost[lost < 0].sum() > -2e-4 * size
 
 
-def test_closed_loops_only_lose_what_rubs(session):
-    check_loops(session, 5, 400, 5e-3)
+@pytest.mark.parametrize("aside", [0, 0.03])
+def test_closed_loops_only_lose_what_is_told(session, aside):
+    check_loops(session, (small_loop(seed, 400, aside) for seed in range(5)), 5e-3)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="one loop loses 0.29 %, one gives 0.97 % of its work back")
-def test_many_closed_loops_lose_nothing_else(session):
-    check_loops(session, 40, 1000, 2e-3)
+@pytest.mark.parametrize("aside", [0, 0.03])
+def test_many_closed_loops_lose_nothing_else(session, aside):
+    check_loops(session, (small_loop(seed, 2000, aside) for seed in range(40)), 2e-3)
+
+
+@pytest.mark.slow
+def test_wide_closed_loops(session):
+    """Round the tube and over several rings."""
+    check_loops(session, (closed_loop(seed, 2000, OUTER) for seed in range(40)), 2e-3)
 
 
 def test_no_pull_and_no_more_than_the_cone_along_a_random_way(session):

@@ -82,7 +82,7 @@ def test_bodies_apart_are_parts(tmp_path):
 
 
 def test_objects_that_touch_are_parts(tmp_path):
-    """An L of two bricks by its objects; the same as one body is refused."""
+    """An L of two bricks by its objects, or all triangles in one."""
     foot, (leg,) = trimesh.creation.box((6, 2, 2)), jaws(2, size=(2, 6, 2))
     leg.apply_translation((0, 4, 0))
     trimesh.Scene({"foot": foot, "leg": leg}).export(tmp_path / "hook.glb")
@@ -90,8 +90,25 @@ def test_objects_that_touch_are_parts(tmp_path):
     assert "2 convex parts" in note
     assert shape.vertices.shape == (2, 3, 8)
     joined(foot, leg).export(tmp_path / "hook.stl")
-    with pytest.raises(MeshError, match="not convex: .* an object of the file .*vhacdx"):
-        read_tool(tmp_path / "hook.stl", None, 0.0)
+    soup, _ = read_tool(tmp_path / "hook.stl", None, 0.0)
+    assert sorted(map(corners, soup.vertices)) == sorted(map(corners, shape.vertices))
+
+
+def corners(part):
+    return sorted(map(tuple, np.asarray(part).T.round(5).tolist()))
+
+
+def test_bricks_that_share_faces_are_parts(tmp_path):
+    """A T of four: the middle has faces in common with three others, also its diagonals."""
+    places = np.array([[0, 0, 0], [-1, 0, 0], [1, 0, 0], [0, 1, 0]])
+    bricks = [trimesh.creation.box((1, 1, 1)) for _ in places]
+    for brick, place in zip(bricks, places, strict=True):
+        brick.apply_translation(place)
+    joined(*bricks).export(tmp_path / "tee.stl")
+    shape, note = read_tool(tmp_path / "tee.stl", None, 0.0)
+    assert "4 convex parts, 32 corners" in note
+    expected = [corners(np.asarray(brick.vertices).T) for brick in bricks]
+    assert sorted(map(corners, shape.vertices)) == sorted(expected)
 
 
 @pytest.mark.parametrize(
