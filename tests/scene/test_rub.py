@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from small_scenes import BALL, BARE, MATERIAL, MESH, OUTER, TUBE, ball, bend, on_arc
-from tool_ways import placed, random_way, turn
+from tool_ways import closed_loop, placed, random_way, turn
 
 from jaxtrachea import Poses, PressStatus, Session, make_scene, simulate
 from jaxtrachea.scene.effects import EffectOptions
