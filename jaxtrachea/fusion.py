@@ -13,6 +13,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +29,18 @@ SUPPORTED_JAXLIB = ("0.10.2", "0.11.2", "0.12.0.1")
 SMALL = 1 << 16
 #: Entries of which a sum, a maximum ... may be taken: of 4,096 or more the compiler asks a library.
 REDUCED = 4000
-#: What calls a library or is a scatter.
-ALIEN = ("dot_general", "scatter", "sort", "top_k", "cholesky", "triangular_solve", "eig", "lu")
+#: What the compiler puts into one kernel: loops, branches and what works entry by entry. It ends
+#: the process over others: what calls a library, a scatter.
+FITTING = frozenset(
+    """abs add add_any and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp
+    closed_call concatenate cond convert_element_type copy cos cumsum custom_jvp_call
+    custom_vjp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv exp
+    exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le le_to linear log log1p
+    logistic lt max min mul ne neg nextafter not optimization_barrier or pad pjit platform_index
+    pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round
+    rsqrt scan select_n sign sin slice split sqrt square squeeze stack stop_gradient sub tan
+    tanh transpose unstack while xla_metadata_value xor""".split()
+)
 
 
 def fuse(part: Callable, *, streams: bool = False) -> Callable:
@@ -46,11 +57,18 @@ def fuse(part: Callable, *, streams: bool = False) -> Callable:
     if not _SUPPORTED:
         return part
 
-    fused = functools.partial(_fused, part, sys.maxsize if streams else SMALL)
+    most = sys.maxsize if streams else SMALL
 
     @custom_vmap
     def alone(*given):
-        return jax.lax.platform_dependent(*given, cpu=fused, default=part)
+        closed, shape = jax.make_jaxpr(part, return_shape=True)(*given)
+        plain, inputs = jaxpr_as_fun(closed), jax.tree.leaves(given)
+        if fits(closed.jaxpr, most):
+            marked = functools.partial(_marked, plain)
+            found = jax.lax.platform_dependent(*inputs, cpu=marked, default=plain)
+        else:
+            found = plain(*inputs)
+        return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     @alone.def_vmap
     def _(count, has_lanes, *given):
@@ -67,27 +85,37 @@ def fuse(part: Callable, *, streams: bool = False) -> Callable:
     return call
 
 
-def _fused(part: Callable, most: int, *given):
-    """The part as a call with the attribute, where it fits."""
-    from jax.experimental.xla_metadata import set_xla_metadata  # not of all versions
+def one_by_one(part: Callable, *rows: Any) -> Any:
+    """`jax.vmap(part)(*rows)`; on a CPU row after row, and going back each once more.
 
-    closed, shape = jax.make_jaxpr(part, return_shape=True)(*given)
-    if not fits(closed.jaxpr, most):
-        return part(*given)
+    For parts that go through a large array several times: those of many rows are out of the cache
+    before they are read again, and fill the memory.
+    """
+    if len(jax.tree.leaves(rows)[0]) == 1:
+        return jax.vmap(part)(*rows)
+    again = jax.checkpoint(part)
+    return jax.lax.platform_dependent(
+        *rows, cpu=lambda *v: jax.lax.map(lambda row: again(*row), v), default=jax.vmap(part)
+    )
+
+
+def _marked(part: Callable, *inputs) -> list:
+    """The part as a call with the attribute."""
+    from jax.experimental.xla_metadata import set_xla_metadata  # not of all versions
 
     @jax.jit
     def kernel(*inputs):
         read = jnp.stack([jnp.ravel(v)[0].astype(jnp.float32) for v in inputs])
-        return jaxpr_as_fun(closed)(*inputs), read
+        return part(*inputs), read
 
     # The compiler ends the process over an input that a kernel does not read: constants are hidden
     # from it, which it would write into the part, and every input is read.
-    inputs = jax.lax.optimization_barrier(jax.tree.leaves(given))
+    inputs = jax.lax.optimization_barrier(inputs)
     found, read = kernel(*inputs)
     marks = {"inlineable": "false", "xla_cpu_small_call": "true"}
     first, read = (set_xla_metadata(v, **marks) for v in (found[0], read))
     found[0] = jax.lax.optimization_barrier((first, read, *inputs))[0]
-    return jax.tree.unflatten(jax.tree.structure(shape), found)
+    return found
 
 
 def fits(jaxpr: Jaxpr, most: int) -> bool:
@@ -95,7 +123,7 @@ def fits(jaxpr: Jaxpr, most: int) -> bool:
     from jax.extend.core import jaxprs_in_params  # not of all versions
 
     return _small([*jaxpr.invars, *jaxpr.constvars], most) and all(
-        not eqn.primitive.name.startswith(ALIEN)
+        eqn.primitive.name in FITTING
         and _small(eqn.outvars, most)
         and (not eqn.primitive.name.startswith(("reduce_", "arg")) or _small(eqn.invars, REDUCED))
         and all(fits(sub, most) for sub in jaxprs_in_params(eqn.params))

@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jaxtrachea._packed import Packing
+from jaxtrachea.fusion import fuse
 from jaxtrachea.scene.simulation import Simulation, surface
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.scene.together import deform_together
@@ -66,11 +68,18 @@ class Row:
 
     def run(self, state, *given):
         """The next state, the contact as one array, and `large` (traced)."""
-        state, contact, large, press = self._one(state, *given)
+
+        def line(*given):
+            # State and contact as two arrays: in one, much of what both need is computed twice.
+            state, contact, large, press = self._one(*given)
+            return state, self.contacts.pack(contact), tuple(large.values()), press
+
+        # By itself it rounds alike in all programs: a scan of steps is the session to the bit.
+        traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(self._scene))
+        state, contact, large, press = (line if traced else fuse(line))(state, *given)
         lay = deform_together if self._scene.instruments else surface
         vertices = lay(self._setting(*given)[0], *press) if self._shown else None
-        large = (*large.values(), *([] if vertices is None else [vertices[0]]))
-        return state, self.contacts.pack(contact), large
+        return state, contact, large if vertices is None else (*large, vertices[0])
 
     def __call__(self, state, *given) -> tuple[Array, Simulation]:
         """The next state, and the result (traced)."""
