@@ -4,8 +4,9 @@ XLA starts a kernel for each of its loops, which takes as long as some hundred o
 small loop it makes one function with all that is in it; an attribute of a call asks for the same.
 The contact of a tool with a mesh is 800 kernels otherwise, and a whole update takes 1.4 times as
 long (tests/bench/marks.py). One thread works through such a function, which calls no library and
-holds no scatter: a product of small matrices is written as a sum (`_numerics.product`), the lowest
-of many are found one by one (`_numerics.lowest`).
+holds no scatter: a product of small matrices is written as a sum (`_numerics.product`, or of a part
+that is also called in batches by `_written_out`), the lowest of many are found one by one
+(`_numerics.lowest`).
 """
 
 import functools
@@ -19,7 +20,9 @@ import jax
 import jax.numpy as jnp
 import jaxlib.version
 from jax.custom_batching import custom_vmap
-from jax.extend.core import Jaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+
+from jaxtrachea._written_out import written_out
 
 #: Versions of jaxlib whose compiler was seen to do it right (tests/test_fusion.py). With others the
 #: part is compiled as it stands: a compiler may refuse a program, or end the process. So it is with
@@ -43,7 +46,7 @@ FITTING = frozenset(
 )
 
 
-def fuse(part: Callable, *, streams: bool = False) -> Callable:
+def fuse(part: Callable, *, products: bool = False, streams: bool = False) -> Callable:
     """The same function, compiled into a single kernel for one call at a time on a CPU.
 
     A batch (`vmap`), a derivative, another device, and a part that does not fit, is compiled as it
@@ -51,6 +54,9 @@ def fuse(part: Callable, *, streams: bool = False) -> Callable:
 
     Args:
         part: from arrays to arrays (or trees of them); closes over nothing that is traced.
+        products: whether products of matrices of at most 64 terms are written out as sums there, so
+            that they can be part of the kernel, which has no marked part in it then; a batch has
+            the library's, which are quicker.
         streams: whether arrays of any size are taken: of a loop whose rounds wait for each other,
             and each read a slice, there is nothing for a second thread to do.
     """
@@ -61,14 +67,19 @@ def fuse(part: Callable, *, streams: bool = False) -> Callable:
 
     @custom_vmap
     def alone(*given):
+        from jax.interpreters.partial_eval import dce_jaxpr  # not of all versions
+
         closed, shape = jax.make_jaxpr(part, return_shape=True)(*given)
-        plain, inputs = jaxpr_as_fun(closed), jax.tree.leaves(given)
-        if fits(closed.jaxpr, most):
-            marked = functools.partial(_marked, plain)
-            found = jax.lax.platform_dependent(*inputs, cpu=marked, default=plain)
-        else:
-            found = plain(*inputs)
-        return jax.tree.unflatten(jax.tree.structure(shape), found)
+        # What is not read is not asked for: another kernel would compute it.
+        jaxpr, read = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+        plain = ClosedJaxpr(jaxpr, closed.consts)
+        sums = written_out(plain) if products else plain
+        inputs = [v for v, own in zip(jax.tree.leaves(given), read, strict=True) if own]
+        found = jaxpr_as_fun(plain)
+        if inputs and fits(sums.jaxpr, most):
+            marked = functools.partial(_marked, jaxpr_as_fun(sums))
+            found = functools.partial(jax.lax.platform_dependent, cpu=marked, default=found)
+        return jax.tree.unflatten(jax.tree.structure(shape), found(*inputs))
 
     @alone.def_vmap
     def _(count, has_lanes, *given):

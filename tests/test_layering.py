@@ -15,6 +15,7 @@ PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
     {"_errors", "_linear", "_compiler", "_threads"},
     {"units", "status", "_numerics", "_arguments", "_packed"},
+    {"_written_out"},
     {"fusion"},
     {"files"},
     {"optimisation"},

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sections_linear import E, beam_shares, span_stiffness, wall_matrices
 
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.sections import block
 from jaxtrachea.mechanics.sections.contact import effective_place, place_on
 from jaxtrachea.mechanics.sections.section import Shape, make_grid
@@ -57,18 +58,20 @@ def random_blocks(n, m, indefinite):
 @pytest.mark.compiling
 @pytest.mark.parametrize("n", [2, 9])
 @pytest.mark.parametrize("indefinite", [False, True])
-@pytest.mark.parametrize("m", [7, 14])
-def test_block_elimination_is_dense(m, indefinite, n):
-    """Alone, and many lanes."""
+@pytest.mark.parametrize(("m", "alone"), [(7, True), (14, False)])
+def test_block_elimination_is_dense(m, alone, indefinite, n):
+    """As single kernels or not; also of many lanes, whose products are the library's."""
     D, U, dense = random_blocks(n, m, indefinite)
     if not indefinite:
         shift = max(0, 1 - np.linalg.eigvalsh(dense)[0])
         D, dense = D + shift * np.eye(m), dense + shift * np.eye(n * m)
     rhs = np.random.default_rng(0).normal(size=(n, m, 2))
 
-    def both(D, U, rhs):
+    def plain(D, U, rhs):
         factors = block.factor(D, U)
         return block.solve(factors, rhs), factors.negative
+
+    both = fuse(plain, products=True) if alone else plain
 
     one = jax.jit(both)(*map(jnp.asarray, (D, U, rhs)))
     scaled = (jnp.stack([v / 2, v, 4 * v]) for v in (D, U))

@@ -48,7 +48,7 @@ class _Loads(NamedTuple):
 
 
 def _added(x, more, place: int, axis: int = 0):
-    """An array with more added at a place along an axis; no scatter."""
+    """An array with more added at a place along an axis; no scatter (`fusion.fuse`)."""
     shape = np.ones(x.ndim, int)
     shape[axis] = x.shape[axis]
     here = (np.arange(x.shape[axis]) == place).reshape(shape)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon, full_precision
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.sections import system as _system
 from jaxtrachea.mechanics.sections.system import State, System
 
@@ -110,13 +111,18 @@ def _size(step, system: System):
 def _newton(z, displacement, system: System):
     """Newton's step from z, the derivative of the solution by the displacement, and stability."""
     state = _state(z, system)
-    found = _system.elements(_system.lines(state, system), state, system)
-    r, tangent = _system.assemble(found, state, displacement, system)
+    close = fuse(_system.lines, products=True)
+    found = _system.elements(close(state, system), state, system)
+    assemble = _system.assemble
+    if system.grid.midline:  # With blocks of 14 x 14 the library is quicker.
+        assemble = fuse(assemble, products=True)
+    r, tangent = assemble(found, state, displacement, system)
     along = jax.tree.map(jnp.zeros_like, r)._replace(
         force=jnp.broadcast_to(system.direction, r.force.shape)
     )
     both = jax.tree.map(lambda x, y: jnp.stack([x, y]), r, along)
-    step, slope = jax.vmap(_flat)(_system.solve_several(tangent, both))
+    both = fuse(_system.solve_several, products=True)(tangent, both)
+    step, slope = jax.vmap(_flat)(both)
     return step, slope, _system.excess_negative(tangent) == 0
 
 
