@@ -282,12 +282,12 @@ def _on_host(
     value, se = jax.tree.map(cut, part.value), jax.tree.map(cut, part.se)
     usable = source.status.predicts
 
-    def hide(v):
+    def hide(v) -> Any:
         return v if usable or v is None else np.full_like(v, np.nan)
 
     skeleton = any(DECLARED[p.name].part not in AT_CONTACT for p in stored.study.parameters)
 
-    def show(v):
+    def show(v) -> Any:
         return hide(v) if skeleton and v is not None else np.full_like(value.joints, np.nan)
 
     presses = np.asarray(part.status[:n])
