@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from jaxtrachea import config
 from jaxtrachea.fitting.parameters import DECLARED
 from jaxtrachea.relaxation.words import Word
-from jaxtrachea.scene import spec
+from jaxtrachea.scene import spec, spec_parts
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.trachea.material import OF_PRESS
 
@@ -74,31 +74,31 @@ TABLES = (
     (
         "Scene: [trachea]",
         "Left out: Table 1 of the paper. Of a file: [simulate.md](simulate.md#a-mesh-of-your-own).",
-        spec.SceneTracheaSection,
+        spec_parts.SceneTracheaSection,
     ),
     (
         "Scene: [wall]",
         "The keys of [wall] of a fit, and:",
-        spec.SceneWallSection,
+        spec_parts.SceneWallSection,
     ),
     (
         "Scene: [tool]",
         "A convex shape about its own origin, capsule and cylinder along z; or several parts.",
-        spec.ShapeSection,
+        spec_parts.ShapeSection,
     ),
-    ("Scene: [tool], beside its shape", "", spec.ToolSection),
-    ("Scene: [[tool.parts]]", "The keys of a shape, and:", spec.PartSection),
+    ("Scene: [tool], beside its shape", "", spec_parts.ToolSection),
+    ("Scene: [[tool.parts]]", "The keys of a shape, and:", spec_parts.PartSection),
     (
         "Scene: [[path]]",
         "Presses (`s`, `displacement`), or motions of the tool (`start` and `end`, `positions`, or "
         "`file`). They do not mix.",
-        spec.PathSection,
+        spec_parts.PathSection,
     ),
     (
         "Scene: [relaxation]",
         "The numbers of its law, those of the skeleton where it relaxes apart (see "
         "[parameters](#parameters)), and:",
-        spec.RelaxationSection,
+        spec_parts.RelaxationSection,
     ),
     ("Scene: [model]", "", spec.LawSection),
     ("Scene: [plan]", "", spec.PlanSection),
@@ -165,7 +165,7 @@ def sources(module: types.ModuleType) -> dict[str, dict[str, tuple[ast.expr, str
     return found
 
 
-SOURCES = {module.__name__: sources(module) for module in (config, spec)}
+SOURCES = {module.__name__: sources(module) for module in (config, spec, spec_parts)}
 
 
 def type_of(annotation: ast.expr) -> tuple[str, str]:

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from jaxtrachea.scene import build
-from jaxtrachea.scene.spec import SceneTracheaSection
+from jaxtrachea.scene.spec_parts import SceneTracheaSection
 from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import Landmarks, read_mesh

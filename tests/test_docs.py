@@ -19,7 +19,7 @@ from jaxtrachea import config, status
 from jaxtrachea.cli.main import app
 from jaxtrachea.config import FitSpec
 from jaxtrachea.fitting import verdict
-from jaxtrachea.scene import spec
+from jaxtrachea.scene import spec, spec_parts
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.section import geometry_of
@@ -415,7 +415,7 @@ def test_the_reference_is_what_its_script_writes():
     assert re.findall(r"^\| `(\w+)` \|", effects, re.M) == list(spec.EffectsSection.model_fields)
 
 
-SOURCES = "\n".join(Path(kind.__file__ or "").read_text() for kind in (config, spec))
+SOURCES = "\n".join(Path(kind.__file__ or "").read_text() for kind in (config, spec, spec_parts))
 
 
 def test_pages_that_messages_name_exist():

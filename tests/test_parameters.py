@@ -19,7 +19,8 @@ from jaxtrachea.fitting.parameters import (
 from jaxtrachea.mechanics.force_law import ON_RING, Law, coefficient, power
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial
-from jaxtrachea.scene.spec import MaterialSection, load_scene_spec
+from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.scene.spec_parts import MaterialSection
 from jaxtrachea.trachea.material import OF_PRESS, OF_TIME, VALUES, Material, material_of
 from jaxtrachea.units import unit_factor
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import punch_fem
 import pytest
-from kernels import computations
 from scipy.integrate import quad
 
 from jaxtrachea.mechanics import beam as point
@@ -173,22 +172,6 @@ def test_compliance_and_law_of_press():
         local = (1 - weight) / 8.18 + weight / 40.0  # compliances add
         np.testing.assert_allclose(1 / local_law(geometry, material, s[i], options).k_1, local)
         np.testing.assert_allclose(got.force, 0.1 / (c[i] + local), rtol=1e-12)
-
-
-@pytest.mark.usefixtures("on_the_cpu")
-@pytest.mark.parametrize("skeleton", ["linear", "softening"])
-def test_lanes_find_the_deflections_once(skeleton):
-    """What is computed for each displacement and ring is not more than under a point."""
-    geometry, depths = table_1(), jnp.linspace(0, 6, 50)
-    material = Material(1930.0, 0.2126, 8.18, 0.0, GA_L=6.97, e_1=0.1, e_2=0.006)
-
-    def operations(half_width):
-        options = Options(shear=True, skeleton=skeleton, half_width=half_width)
-        lanes = jax.jit(jax.vmap(lambda s: press(geometry, material, s, depths, options)[:4]))
-        _, bodies = computations(lanes.lower(jnp.linspace(20.0, 140.0, 8)).compile().as_text())
-        return max(len(body) for body in bodies.values() if "= f64[8,50,15]" in body[-1][1])
-
-    assert operations(HALF) <= operations(0.0)
 
 
 @pytest.mark.slow

@@ -234,30 +234,27 @@ class FitResult:
                 "xarray is not installed; install it with pip install 'jaxtrachea[dataset]'"
             ) from None
         study, names = self.study, [self.study.lane_name(k) for k in range(self.lanes)]
-        size = self.theta.shape[1]
-        labels = [[unknown_label(self, k, i) if i < len(study.unknowns[k]) else ""
-                   for i in range(size)] for k in range(self.lanes)]  # fmt: skip
-        assessed = [[assess(self, k, i, profiles) if i < len(study.unknowns[k]) else None
-                   for i in range(size)] for k in range(self.lanes)]  # fmt: skip
-        both, per_lane = ("lane", "unknown"), ("lane",)
+        both, per_lane, size = ("lane", "unknown"), ("lane",), self.theta.shape[1]
 
-        def word(j):
-            return "" if j is None else j.verdict
+        def filled(value, blank):
+            return [
+                [value(k, i) if i < len(unknowns) else blank for i in range(size)]
+                for k, unknowns in enumerate(study.unknowns)
+            ]
 
-        def end(j, side):
-            return np.nan if j is None else getattr(j, side)
+        def assessed(name, blank: Any = np.nan):
+            return both, [[blank if j is None else getattr(j, name) for j in row] for row in every]
 
-        units = [
-            [p.unit for p, _, _ in lane] + [""] * (size - len(lane)) for lane in study.unknowns
-        ]
+        labels = filled(lambda k, i: unknown_label(self, k, i), "")
+        every = filled(lambda k, i: assess(self, k, i, profiles), None)
         data = {
             "parameter": (both, labels),
-            "unit": (both, units),
+            "unit": (both, filled(lambda k, i: study.unknowns[k][i][0].unit, "")),
             "value": (both, self.value),
-            "standard_error": (both, [[end(j, "standard_error") for j in row] for row in assessed]),
-            "low95": (both, [[end(j, "low") for j in row] for row in assessed]),
-            "high95": (both, [[end(j, "high") for j in row] for row in assessed]),
-            "verdict": (both, [[word(j) for j in row] for row in assessed]),
+            "standard_error": assessed("standard_error"),
+            "low95": assessed("low"),
+            "high95": assessed("high"),
+            "verdict": assessed("verdict", ""),
             "at_bound": (both, self.at_bound),
             "status": (per_lane, [FitStatus(int(v)).name.lower() for v in self.status]),
             "iterations": (per_lane, self.iterations),

@@ -36,6 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import product
 from jaxtrachea.mechanics import press, skeleton
 from jaxtrachea.mechanics.skeleton import Rings, local_frame
 from jaxtrachea.mechanics.softening import Softening
@@ -182,5 +183,5 @@ def _by_angle(geometry: Geometry, material: Material, solved: StraightPress, rin
 
     phi = solved.phi
     change = jax.jvp(turning, (phi,), (jnp.ones_like(phi),))[1]
-    P = solved.loads[:, 1:] @ local_frame(phi)[::2, 1:].T
-    return -jnp.sum(P * jnp.einsum("ipq,iq->ip", change, P)) / 2
+    P = product(solved.loads[:, 1:], local_frame(phi)[::2, 1:].T)
+    return -jnp.sum(P[:, :, None] * change * P[:, None]) / 2

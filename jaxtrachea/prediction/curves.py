@@ -282,35 +282,18 @@ def _on_host(
     value, se = jax.tree.map(cut, part.value), jax.tree.map(cut, part.se)
     usable = source.status.predicts
 
-    def hide(v):
-        return v if usable else np.full_like(v, np.nan)
+    def hide(v) -> Any:
+        return v if usable or v is None else np.full_like(v, np.nan)
 
     skeleton = any(DECLARED[p.name].part not in AT_CONTACT for p in stored.study.parameters)
 
-    def show(v):
-        return hide(v) if skeleton else np.full_like(v, np.nan)
-
-    def maybe(v):
-        return None if v is None else hide(v)
+    def show(v) -> Any:
+        return hide(v) if skeleton and v is not None else np.full_like(value.joints, np.nan)
 
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
-    beyond, deep, foreign = "", "", []
-    if usable:
-        fitted = pressed(stored)
-        spans, angles = fitted.spans[source.lane], fitted.angles[source.lane]
-        tilts = fitted.tilts[source.lane]
-        aside = (angles, phi, "phi"), (tilts, tilt_of(direction), "tilt")
-        model, counted = stored.study.model, counted_from(stored.study.parameters)
-        depth = depths(displacement, onset_of(stored, source), model.options)
-        beyond = _beyond(spans, float(s), depth, aside, counted)
-        deepest = float(np.max(np.abs(depth)))
-        deep = unvalidated(model.options, float(model.geometry.radius), deepest, counted)
-        foreign = [p.name for p in stored.study.parameters if p.foreign]
-        if foreign and deepest <= fitted.reached(source.lane, float(s), phi, direction) + 1e-9:
-            foreign = []  # the fit has seen such a press
+    outside, foreign = _outside(stored, source, where, displacement) if usable else ([], [])
     status, message = _verdict(source, value, se, presses, bend, foreign)
-    message = "; ".join(filter(None, [message, beyond, deep]))
     return CurvePrediction(
         specimen=source.specimen,
         trial=source.trial,
@@ -322,19 +305,41 @@ def _on_host(
         sigma=np.full(n, source.sigma[0]) if sigma is None else sigma,
         joints=show(value.joints),
         joints_se=show(se.joints),
-        reactions=show(_nothing(value) if value.reactions is None else value.reactions),
-        reactions_se=show(_nothing(value) if se.reactions is None else se.reactions),
+        reactions=show(value.reactions),
+        reactions_se=show(se.reactions),
         joint_sigma=_marker_sigma(stored, source, displacement),
         status=status,
-        message=message,
+        message="; ".join(filter(None, [message, *outside])),
         press_status=presses,
         phi=float(phi),
         direction=direction,
-        side_force=maybe(value.side_force),
-        side_se=maybe(se.side_force),
-        joint_side=maybe(value.joint_side),
-        joint_side_se=maybe(se.joint_side),
+        side_force=hide(value.side_force),
+        side_se=hide(se.side_force),
+        joint_side=hide(value.joint_side),
+        joint_side_se=hide(se.joint_side),
     )
+
+
+def _outside(
+    stored: FitResult, source: CurveParameters, where, displacement
+) -> tuple[list[str], list[str]]:
+    """What of a press the data do not hold, in words; the values of another tube it rests on."""
+    s, phi, direction = where
+    fitted, lane = pressed(stored), source.lane
+    aside = (
+        (fitted.angles[lane], phi, "phi"), (fitted.tilts[lane], tilt_of(direction), "tilt"),
+    )  # fmt: skip
+    model, counted = stored.study.model, counted_from(stored.study.parameters)
+    depth = depths(displacement, onset_of(stored, source), model.options)
+    deepest = float(np.max(np.abs(depth)))
+    words = [
+        _beyond(fitted.spans[lane], float(s), depth, aside, counted),
+        unvalidated(model.options, float(model.geometry.radius), deepest, counted),
+    ]
+    foreign = [p.name for p in stored.study.parameters if p.foreign]
+    if foreign and deepest <= fitted.reached(lane, float(s), phi, direction) + 1e-9:
+        foreign = []  # the fit has seen such a press
+    return words, foreign
 
 
 def _marker_sigma(stored: FitResult, source: CurveParameters, displacement) -> np.ndarray:
@@ -344,11 +349,6 @@ def _marker_sigma(stored: FitResult, source: CurveParameters, displacement) -> n
         return np.full(len(displacement), source.sigma[1])
     depth = depths(displacement, onset_of(stored, source), stored.study.model.options)
     return 1 / Noise(joints=given[0], joints_share=given[1]).joints_precision(depth)
-
-
-def _nothing(value: Response) -> np.ndarray:
-    """Reactions of a model that has none."""
-    return np.full_like(value.joints, np.nan)
 
 
 def _bend(

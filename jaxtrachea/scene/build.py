@@ -33,7 +33,8 @@ from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.paths import named_file, path_of, read_table
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
-from jaxtrachea.scene.spec import NEEDED, SceneSpec, SceneTracheaSection, ShapeSection, ToolSection
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.scene.spec_parts import NEEDED, SceneTracheaSection, ShapeSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
 from jaxtrachea.scene.tool_file import read_tool
 from jaxtrachea.trachea.geometry import Geometry

@@ -11,6 +11,7 @@ from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
+from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.mechanics.validation import has_solution
 from jaxtrachea.scene import trail
@@ -68,7 +69,11 @@ def deform(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach
     moved = moved._replace(dissipated=None, status=None)
     led = path if slides and made is not None else None
     share = regions.weigh(binding, where[1]) if together else None
-    return jax.vmap(one, (0, None if together else 0, 0, None))(moved, where, led, share)
+
+    def row(moved, own, pose):
+        return one(moved, where if together else own, pose, share)
+
+    return one_by_one(row, moved, None if together else where, led)
 
 
 def _held_at(scene: Scene, s_c):

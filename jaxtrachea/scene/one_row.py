@@ -1,11 +1,5 @@
-"""A program of one row that is called many times: numbers go in and out as few arrays.
+"""A program of one row that is called many times: numbers go in and out as few arrays."""
 
-What there is for every ring or vertex is written where an earlier call wrote it, if nobody holds
-that any more.
-"""
-
-import copy
-import sys
 from collections.abc import Callable
 from operator import itemgetter
 from typing import Any
@@ -14,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jaxtrachea._packed import Packing
+from jaxtrachea.fusion import fuse
 from jaxtrachea.scene.simulation import Simulation, surface
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.scene.together import deform_together
 
 #: Arrays of the result that have a number for every ring or vertex.
 LARGE = ("joints", "loads", "end_U", "end_V", "vertices")
-#: Sets of them that are kept: one that the loop holds, one that is written, and what others hold.
-SETS = 4
 
 
 class Row:
@@ -66,11 +60,18 @@ class Row:
 
     def run(self, state, *given):
         """The next state, the contact as one array, and `large` (traced)."""
-        state, contact, large, press = self._one(state, *given)
+
+        def line(*given):
+            # State and contact as two arrays: in one, much of what both need is computed twice.
+            state, contact, large, press = self._one(*given)
+            return state, self.contacts.pack(contact), tuple(large.values()), press
+
+        # By itself it rounds alike in all programs: a scan of steps is the session to the bit.
+        traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(self._scene))
+        state, contact, large, press = (line if traced else fuse(line))(state, *given)
         lay = deform_together if self._scene.instruments else surface
         vertices = lay(self._setting(*given)[0], *press) if self._shown else None
-        large = (*large.values(), *([] if vertices is None else [vertices[0]]))
-        return state, self.contacts.pack(contact), large
+        return state, contact, large if vertices is None else (*large, vertices[0])
 
     def __call__(self, state, *given) -> tuple[Array, Simulation]:
         """The next state, and the result (traced)."""
@@ -81,10 +82,10 @@ class Row:
 
 
 class OneRow:
-    """A compiled program, and the memory that it writes into.
+    """A compiled program, and the state that its next call begins with.
 
     Attributes:
-        state: that the next call begins with.
+        state: -
     """
 
     def __init__(
@@ -102,53 +103,18 @@ class OneRow:
         """
         row = Row(scene, setting, step)
         row.trace(state, *given)
-        self._contacts, contact, large = row.contacts, row.contact, row.large
-        self._shapes = tuple(large.values())
-        self._sets = [self._empty(), self._empty()]
-        self._own = _holders(self._sets[0])
-
-        def run(state, _, *given):
-            return row.run(state, *given)
-
-        # Donated: the new state and the large arrays are written where the old ones were.
-        program = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
-        self._run = program.lower(state, self._sets[0], *given).compile()
+        self._contacts = row.contacts
+        self._run = jax.jit(row.run, keep_unused=True).lower(state, *given).compile()
         self.state = jnp.array(state)
-        names = [n for n in Simulation._fields if getattr(contact, n) is not None]
-        where = {name: i for i, name in enumerate([*names, *large])}
+        names = [n for n in Simulation._fields if getattr(row.contact, n) is not None]
+        where = {name: i for i, name in enumerate([*names, *row.large])}
         self._order = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
 
     def __call__(self, *given: Any) -> Simulation:
         """The finished result: numpy arrays, and `LARGE` on the device."""
-        free = self._free() if self._shapes else ()
-        self.state, packed, large = self._run(self.state, free, *given)
-        if large:
-            self._sets.append(large)
+        self.state, packed, large = self._run(self.state, *given)
         contact = self._contacts.leaves(np.asarray(packed))  # waits for all of them
         return Simulation._make(self._order((*contact, *large, None)))
-
-    def copy(self) -> "OneRow":
-        """The same program with memory and state of its own."""
-        new = copy.copy(self)
-        new.state, new._sets = jnp.array(self.state), [self._empty(), self._empty()]
-        return new
-
-    def _empty(self) -> tuple[Array, ...]:
-        return tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in self._shapes)
-
-    def _free(self) -> tuple[Array, ...]:
-        """Memory to write into: the oldest set that nobody else holds, else a new one."""
-        for i, large in enumerate(self._sets):
-            if _holders(large) <= self._own:
-                return self._sets.pop(i)
-        if len(self._sets) == SETS:
-            del self._sets[0]  # it lasts as long as its holder
-        return self._empty()
-
-
-def _holders(large: tuple[Array, ...]) -> int:
-    """References to that array of a set which most hold."""
-    return max((sys.getrefcount(v) for v in large), default=0)
 
 
 def _apart(result: Simulation) -> tuple[Simulation, dict[str, Array]]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.contact.pose import pose_from_vector
-from jaxtrachea.scene.spec import PathSection, SceneSpec
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.scene.spec_parts import PathSection
 from jaxtrachea.scene.stage import Poses, Presses
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.units import UnitError, column_unit, convert

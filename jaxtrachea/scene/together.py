@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import full_precision, product_of_rows
+from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.influence import Influence, influence, level_influence
 from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond
@@ -228,4 +229,4 @@ def deform_together(scene: Scene, moved: Together) -> Float[Array, "rows vertice
         return place(mesh, u)
 
     rows = moved.skeleton, moved.depth, moved.joints, moved.slopes, moved.turns
-    return mask_rows(moved.hidden, jax.vmap(one)(rows))
+    return mask_rows(moved.hidden, one_by_one(one, rows))

@@ -11,7 +11,8 @@ from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.build import Staged, stage
 from jaxtrachea.scene.paths import path_of
 from jaxtrachea.scene.session import Session
-from jaxtrachea.scene.spec import PathSection, SceneSpec, ToolSection, load_scene_spec
+from jaxtrachea.scene.spec import SceneSpec, load_scene_spec
+from jaxtrachea.scene.spec_parts import PathSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Scene
 
 #: The tool of a scene that has none: the last joint of a finger, across the tube.

@@ -1,11 +1,11 @@
 """What each mark of `jaxtrachea.fusion` gives: rows of the mission with and without it, in turns.
 
-    PYTHONPATH=tests/reference python tests/bench/marks.py [SITE ...] [--kinds A,B]
+    PYTHONPATH=tests/reference python tests/bench/marks.py [SITE ...]
 
-A site is a call of `fuse` or `map_sequentially` in one module. It alone is taken off (the part is
-compiled as it stands) and the rows that it can reach are timed against the package as it is: two
-processes in turns, blocks of calls. Given is the ratio of medians, without over with: 1.3 means
-that the mark makes the row 1.3 times as fast.
+A site is a call of `fuse` in one module. It alone is taken off (the part is compiled as it stands)
+and the rows that it can reach are timed against the package as it is: two processes in turns,
+blocks of calls. Given is the ratio of medians, without over with: 1.3 means that the mark makes the
+row 1.3 times as fast.
 """
 
 import argparse
@@ -16,30 +16,21 @@ import subprocess
 import sys
 import time
 
-#: By site: module, mark, kinds of rows it reaches.
-SCENE = ("step", "session")
+#: By site: module, kinds of rows it reaches.
 SITES = {
-    "none": ("", "", ()),
-    "all": ("", "", (*SCENE, "bound")),
-    "inner": ("", "", SCENE),
-    "skeleton": ("scene.simulation", "fuse", SCENE),
-    "row": ("scene.one_row", "fuse", ("session",)),
-    "vertices": ("scene.deform", "map_sequentially", (*SCENE, "lanes")),
-    "contact": ("scene.stage", "fuse", SCENE),
-    "reach": ("surface.local", "fuse", SCENE),
-    "sections": ("mechanics.sections.solve", "fuse", ("sections",)),
-    "bound": ("mechanics.bound", "fuse", ("bound",)),
+    "none": ("", ()),
+    "contact": ("scene.stage", ("step", "session")),
+    "row": ("scene.one_row", ("session",)),
+    "relaxation": ("relaxation.steps", ("relaxing",)),
 }
 BLOCKS = 12
 
 
 def strike(site: str) -> None:
-    """Take one mark off; `all`; or all `inner` ones, which a session's own mark encloses."""
-    for name, (module, mark, _) in SITES.items():
-        if module and (name == site or site == "all" or (site == "inner" and name != "row")):
-            found = importlib.import_module(f"jaxtrachea.{module}")
-            assert hasattr(found, mark), name
-            setattr(found, mark, lambda part, **_: part)
+    """Take one mark off."""
+    module = SITES[site][0]
+    if module:
+        importlib.import_module(f"jaxtrachea.{module}").fuse = lambda part, **_: part
 
 
 def rows(kind: str) -> dict:
@@ -48,7 +39,7 @@ def rows(kind: str) -> dict:
     import jax.numpy as jnp
     import numpy as np
 
-    if kind in (*SCENE, "lanes"):
+    if kind in ("step", "session"):
         import gradient
         import update
 
@@ -78,51 +69,24 @@ def rows(kind: str) -> dict:
         one = gradient.arguments(jnp.float64, material, 1)
         many = gradient.arguments(jnp.float64, material, 32)
         grad = jax.value_and_grad(value)
-        if kind == "lanes":
-            return {"32 updates, gradient": gradient.wait(jax.vmap(grad), *many)}
         return {
             "update": gradient.wait(value, *one),
             "update, gradient": gradient.wait(grad, *one),
             "32 updates": gradient.wait(jax.vmap(value), *many),
         }
-    from jaxtrachea import Material, table_1
-
-    tube = table_1()
-    if kind == "sections":
-        from test_press import VALUES
-
-        from jaxtrachea.mechanics.sections.material import SectionMaterial
-        from jaxtrachea.mechanics.sections.press import press_sections
-
-        material = SectionMaterial(**{k: jnp.asarray(v) for k, v in VALUES.items()})
-        path = jnp.linspace(0.1, 2.0, 20)
-
-        def force(material, s):
-            return jnp.sum(press_sections(tube, material, s, jnp.asarray(0.4), path).force[:, 1])
-
-        s = jnp.asarray(73.0)
-        lanes = jnp.linspace(40.0, 90.0, 16)
-        grad = jax.grad(force)
+    if kind == "relaxing":
         import gradient
+        import relaxing_cost
 
-        return {
-            "sections": gradient.wait(force, material, s),
-            "sections, gradient": gradient.wait(grad, material, s),
-            "16 sections": gradient.wait(jax.vmap(force, (None, 0)), material, lanes),
-        }
-    if kind == "bound":
-        from jaxtrachea import bind
+        from jaxtrachea.fitting.cost import evaluate
 
-        material, s, D = Material(100.0, 1.0, 1.0, 0.01), 40.0, 2.0
-        run = bind(tube, material, s, D)
-        numbers = run.pack(material, s, D)
+        study = relaxing_cost.study_of(16)
+        free = jnp.zeros((16, len(study.model.free)))
 
-        def twenty():
-            for _ in range(20):
-                out = run(numbers)
-            return out
+        def cost(free, lane):
+            return evaluate(study.model, free, lane, jnp.ones(2))
 
-        return {"bound press": twenty}
+        return {"16 relaxing residuals": gradient.wait(jax.vmap(cost), free, study.lanes)}
     raise ValueError(kind)
 
 
@@ -163,7 +127,7 @@ def main() -> None:
     import statistics
 
     for site in asked.sites or [s for s in SITES if s != "none"]:
-        for kind in asked.kinds.split(",") if asked.kinds else SITES[site][2]:
+        for kind in asked.kinds.split(",") if asked.kinds else SITES[site][1]:
             running = [
                 subprocess.Popen(
                     [sys.executable, __file__, "--work", name, kind], text=True,

@@ -33,6 +33,8 @@ from jaxtrachea.mechanics.levels.options import Options
 
 STEP, COUNT, PLACE = 0.05, 200, 75.0
 TIMES = STEP * np.arange(COUNT)
+BEGUN = {"gamma_1": {"value": 0.5}, "gamma_2": {"value": 0.5}, "tau_1": {"value": TAU[0]},
+         "tau_ratio_2": {"value": TAU[1] / TAU[0]}}  # fmt: skip
 CORNERS = np.array([0.0, 2.0, TIMES[-1]]), np.array([0.0, 4.0, 4.0])
 WAY = np.interp(TIMES, *CORNERS)
 
@@ -84,6 +86,11 @@ def made(count, c):
     return forces, curves
 
 
+def study_of(count):
+    """The study of so many records."""
+    return build_study(made(count, compliance(PLACE))[1], TUBE, UNIFORM, KNOWN | FREE | BEGUN)
+
+
 def memory(study):
     """Bytes that residual and Jacobian of all lanes work in."""
     free = jax.numpy.zeros((len(study.lanes.s_c), len(study.model.free)))
@@ -105,9 +112,7 @@ def main():
     asked = parser.parse_args()
     c = compliance(PLACE)
     forces, curves = made(asked.records, c)
-    begun = {"gamma_1": {"value": 0.5}, "gamma_2": {"value": 0.5}, "tau_1": {"value": TAU[0]},
-             "tau_ratio_2": {"value": TAU[1] / TAU[0]}}  # fmt: skip
-    study = build_study(curves, TUBE, UNIFORM, KNOWN | FREE | begun)
+    study = build_study(curves, TUBE, UNIFORM, KNOWN | FREE | BEGUN)
     settings = Settings(starts=1, more_starts=0, verify=False)
     seconds = []
     for _ in range(4):

@@ -227,10 +227,9 @@ capsule, and the angular weights prepared; called through ctypes. coal is called
 capsules. The paper states 10 kHz for the skeleton and 1 kHz with the surface (100 and 1,000 µs).
 
 The contact alone was some 500 small kernels with a ball on the round tube and 800 with a box on
-the mesh, most of them in a loop of twelve rounds. For one pose on a CPU contact and skeleton now
-are one kernel each, as are small parts of the surface (`jaxtrachea/fusion.py`; counted by
-`tests/test_kernels.py`, gains in [measured.md](measured.md)). 256 poses together share the small
-kernels.
+the mesh, most of them in a loop of twelve rounds. For one pose on a CPU it is one kernel now
+(`jaxtrachea/fusion.py`, gains in [measured.md](measured.md)); when these times were taken skeleton
+and parts of the surface were, too. 256 poses together share the small kernels.
 Slow calls come to all rows, the C loop included: the core is shared, and its speed may change
 between two blocks of calls. Goals against the C loop are of calls in turns.
 """

@@ -219,11 +219,10 @@ the material. Fit: residual of 4 positions × 50 points, its Jacobian by four pa
 and a whole step (residual, Jacobian, normal equations, one more residual for the curvature, the
 trust region). Times are per lane. In brackets: ratio of the smallest samples.
 
-Small parts of a program, and their derivatives, are one kernel each for one pose on a CPU. Many
-poses together (`vmap`) cannot be that, and their arrays are in fresh memory at every call; so
-surfaces, and their derivatives, are taken one pose after the other. `jax.lax.map` over the function
-that gives value and gradient (one at a time) does so with everything. A step of the fit has a
-second residual in it, for the curvature.
+When these times were taken small parts of a program, and their derivatives, were one kernel each
+for one pose on a CPU, and surfaces of many poses were taken one after the other. `jax.lax.map` over
+the function that gives value and gradient (one at a time) does so with everything. A step of the
+fit has a second residual in it, for the curvature.
 """
 COMMANDS = """\
 Whole processes. Cold: the folder of compiled programs is empty; warm: as the cold start left it.
