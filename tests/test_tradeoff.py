@@ -314,36 +314,6 @@ def test_chosen_plan_is_within_the_tolerance():
     assert choice.cost.share == 1
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_two_effects_within_tolerance_can_break_it_together():
-    spec, made = staged(GA_L="10 N")
-    full = full_scene(spec, made)
-    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
-    options = made.scene.plan.options
-
-    def plan(**less):
-        return (dataclasses.replace(
-        made.scene, plan=dataclasses.replace(
-            made.scene.plan, options=dataclasses.replace(options, **less),
-            ignored=frozenset({"shear", "two_material"}))))  # fmt: skip
-
-    kept = {"precision": "float64"}
-    loose = choose(full, 0.1, **kept)
-    alone = {rung.ladder: rung.errors.worst for rung in loose.dropped}
-    assert loose.errors.worst > max(alone.values())
-    tolerance = (loose.errors.worst + max(alone.values())) / 2
-    choice = choose(full, tolerance, **kept)
-    assert len(choice.dropped) == len(choice.restored) == 1
-    saved = {rung.ladder: rung.saved for rung in loose.dropped}
-    assert choice.restored[0].ladder == max(alone, key=lambda k: alone[k] / saved[k])
-    assert choice.errors.worst <= tolerance
-    reference = solve(full.scene, made.material, made.path)
-    both = solve(plan(shear=False, local="uniform"), made.material, made.path)
-    assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
-    assert off(both, reference) > 0
-
-
 def test_a_tolerance_needs_something_to_be_measured_by():
     lifted = SCENE | {"path": SCENE["path"] | {"displacement": ["0 mm", "1 mm", "0 mm"]},
                       "model": {"contact": "unilateral"}}  # fmt: skip

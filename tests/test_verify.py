@@ -281,17 +281,14 @@ def joint_study(seed, shared, count, share):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    ("seeds", "shared", "count"), [((1,), ("EI_L",), 2), (range(4), ("k_1", "k_3"), 2)]
-)
-def test_a_joint_fit_says_what_it_has_not_looked_at(seeds, shared, count):
+def test_a_joint_fit_says_what_it_has_not_looked_at():
     """No wrong unknown is identifiable; with local errors alone 7 of 8, 30 of 53, 9 of 21 were.
 
     All come to rest, also where an unknown is best at infinity (seed 2 had stalled).
     """
     words = []
-    for seed in seeds:
-        study, truth = joint_study(seed, shared, count, 0.002)
+    for seed in range(4):
+        study, truth = joint_study(seed, ("k_1", "k_3"), 2, 0.002)
         result = fit(study, Settings(starts=4))
         assert np.all(result.status <= FitStatus.UNIDENTIFIABLE), seed
         word, _, false = verdicts(result, truth)
