@@ -309,7 +309,7 @@ def _unpadded(shape: Shape) -> Shape:
 
 def _moved(shape: Shape, pose: Pose) -> Shape:
     """A shape in another frame."""
-    return dataclasses.replace(shape, vertices=transform(pose, shape.vertices))
+    return dataclasses.replace(shape, vertices=jax.jit(transform)(pose, shape.vertices))
 
 
 def padded(shape: Shape, count: int) -> Shape:
