@@ -14,7 +14,6 @@ from run_cli import run
 from tradeoff_page import choice_rows, fronts
 from tradeoff_scene import DEPTH, K_1, K_3, SCENE, TOML
 
-from jaxtrachea.config import SpecError
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.effects import EFFECTS
@@ -187,36 +186,6 @@ def test_ladders_of_a_scene_and_why_others_are_left_out():
     assert kept_rings(full, 3).tolist() == [2, 3, 4]  # 30, 40, 50 mm beside 42 mm
     kinds = {ladder.name: ladder.kind for ladder in found}
     assert (kinds["form"], kinds["dtype"], kinds["shear"]) == ("algebra", "truncation", "model")
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_ladder_of_the_skeleton():
-    """Linear instead of softening errs as by hand; coupling is not climbed; vectors have none."""
-    law = {"e_1": "0.1 1/mm", "e_2": "0.005 1/mm^2", "k_1": "1e6 N/mm", "k_3": "0 N/mm^3"}
-    plain = {name: v for name, v in SCENE["material"].items() if name not in ("k_1_ring", "GA_L")}
-    full = full_scene(*staged(SCENE | {"material": plain}, **law))
-    found, out = ladders(full)
-    ladder = next(v for v in found if v.name == "skeleton")
-    assert (list(ladder.rungs), ladder.kind) == (["linear", "softening"], "model")
-    assert out["coupling"] == "a skeleton that softens needs coupling 'series'"
-    assert "coupling" not in {v.name for v in found}
-    soft, linear = (
-        jax.jit(simulate)(*program(full, ladder.levels(full, rung))).force[-1, 1]
-        for rung in ("softening", "linear")
-    )
-    # Rigid contact: g(D) against D.
-    assert soft / linear == pytest.approx(1 - 0.1 * DEPTH + 0.005 * DEPTH**2, rel=1e-5)
-    with pytest.raises(SpecError, match="effects.skeleton: 'auto'.*second plane"):
-        staged(SCENE | {"effects": {"second_plane": "on"}}, **law)
-    # A shallow press: the rules take the linear one, the finest is what softens.
-    spec = SCENE | {"path": SCENE["path"] | {"displacement": ["0 mm", "-0.1 mm", "0 mm"]}}
-    spec, made = staged(spec | {"material": plain}, **law)
-    assert made.scene.plan.level("skeleton") == "linear"
-    full = full_scene(spec, made)
-    assert full.levels.plan.level("skeleton") == "softening"
-    assert choose(full, 0.02).levels.plan.level("skeleton") == "linear"
-    assert choose(full, 0.002).levels.plan.level("skeleton") == "softening"
 
 
 def test_the_finest_level_is_no_wish_of_the_user():
