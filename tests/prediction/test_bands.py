@@ -50,9 +50,9 @@ def check_coverage(read, noise):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_bands_cover_in_2000_fits(tmp_path):
+def test_bands_cover_in_500_fits(tmp_path):
     """Truth from finite elements; parameters known to 10 to 24 %."""
-    noisy_study(tmp_path, 0.15, 2000, 70)
+    noisy_study(tmp_path, 0.15, 500, 70)
     check_coverage(jaxtrachea.read_results(tmp_path), 0.15)
 
 
