@@ -285,7 +285,6 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
     most = max(part.vertices.shape[1] for part in found)
     if any(part.vertices.shape[1] < most or part.counts is not None for part in found):
         found = [padded(part, most) for part in found]
-
     return jax.tree.map(lambda *v: _array(_numbers(v)), *found)
 
 
@@ -329,8 +328,9 @@ def padded(shape: Shape, count: int) -> Shape:
         raise ValueError(f"count: expected at least {present} (the vertices), found {count}")
     again = np.arange(count)
     vertices = _numbers(shape.vertices)[:, again % present]
-    counts = np.ones(present) if shape.counts is None else _numbers(shape.counts)
-    counts = (counts[again % present] * (again < present)).astype(vertices.dtype)
+    counts = (again < present).astype(vertices.dtype)
+    if shape.counts is not None:
+        counts = counts * _numbers(shape.counts)[again % present]
     return Shape(_array(vertices), shape.radius, _array(counts))
 
 
@@ -343,7 +343,7 @@ def _numbers(value, dtype=None):
 
 
 def _array(value) -> Array:
-    return jax.device_put(value) if isinstance(value, np.ndarray) else value
+    return value if isinstance(value, Array) else jax.device_put(value)
 
 
 def _shape(vertices, radius) -> Shape:
