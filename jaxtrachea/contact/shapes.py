@@ -187,8 +187,8 @@ def sphere(radius: ArrayLike, dtype=None) -> Shape:
         radius: mm, not negative.
         dtype: of the shape; default JAX's default.
     """
-    r = _numbers(radius, dtype)
-    return _shape(np.zeros((3, 1), jnp.result_type(r, float) if dtype is None else dtype), r)
+    dtype = jnp.result_type(radius, float) if dtype is None else dtype
+    return _shape(np.zeros((3, 1), dtype), radius)
 
 
 def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
@@ -199,8 +199,8 @@ def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
         radius: mm, not negative.
         dtype: of the shape; default that of `half_length`.
     """
+    dtype = jnp.result_type(half_length, float) if dtype is None else dtype
     half = _numbers(half_length, dtype)
-    half = half.astype(jnp.result_type(half, float) if dtype is None else half.dtype)
     return _shape(half * np.array([[0, 0], [0, 0], [-1, 1]], half.dtype), radius)
 
 
