@@ -53,11 +53,12 @@ def test_one_part_in_the_lumen_is_enough():
         [sphere(2.0)] * 2,
         [pose_from_vector(jnp.zeros(3), jnp.array([0, y, 0.0])) for y in (0.0, 18)],
     )
-    turns, places = np.tile(np.eye(3), (2, 1, 1)), [[75, y, 0.0] for y in (0.0, OUTER + 1.0)]
-    path = jt.Poses(turns, np.array(places))
+    path = jt.Poses(np.eye(3)[None], np.array([[75, 0.0, 0.0]]))
+    outside = jt.Poses(np.eye(3)[None], np.array([[75, OUTER + 1.0, 0.0]]))
     scene = made(jaws, path)
     inside = jax.jit(lambda path: in_lumen(scene, path, touch_tube(scene, path)))
-    assert inside(path).tolist() == [True, False]
+    assert inside(path).tolist() == [True]
+    assert inside(outside).tolist() == [False]
 
 
 @pytest.mark.slow
