@@ -243,19 +243,6 @@ def test_what_is_timed_of_a_tool_is_its_step():
         assert found.status == expected.status
 
 
-@pytest.mark.slow
-def test_plan_says_what_was_made_least(tmp_path, monkeypatch, capsys):
-    path = tmp_path / "scene.toml"
-    path.write_text(TOML + '[plan]\ntolerance = "10 %"\ncost = "path"\n')
-    code, out, _ = run(monkeypatch, capsys, "plan", path, "--time")
-    out = " ".join(out.split())
-    assert code == 0
-    assert "time measured on this machine: " in out
-    assert "ms for the whole path in one call, " in out
-    none = "nothing that is within 10 % surely saves time" in out  # where noise hides it
-    assert none or "measured here for the whole path in one call: " in out
-
-
 def test_a_bad_word_for_the_cost(tmp_path, monkeypatch, capsys):
     path = tmp_path / "scene.toml"
     path.write_text(TOML + '[plan]\ntolerance = "10 %"\ncost = "lane"\n')
