@@ -9,7 +9,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import synthetic
 from run_cli import GOOD, run
 
 from jaxtrachea.fitting.build import build_study
@@ -209,24 +208,3 @@ def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
         code, _, err = run(monkeypatch, capsys, "fit", "spec.toml")
         assert code == 2
         assert says in err
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_markers_are_resampled_as_well():
-    """Four unknowns from forces and markers: bootstrap and local errors agree to 15 %."""
-    kind = "residual"
-    force, joints = synthetic.forces(np.array([[300.0, 1.0, 0.5, 0.2]]))
-    rng = np.random.default_rng(2)
-    force = force + 0.01 * force.max() * rng.normal(size=force.shape)
-    rings = np.array([3, 8, 10])
-    seen = joints[..., rings] + 0.02 * rng.normal(size=(*force.shape, 3))
-    data = [
-        dataclasses.replace(c, joint_rings=rings, joint_displacement=seen[0, i])
-        for i, c in enumerate(synthetic.curves(force))
-    ]
-    table = synthetic.parameters(joints=True)
-    result = fit(build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, table), ONE)
-    found = bootstrap(result, ONE, count=400, kind=kind)
-    assert found.usable.all()
-    np.testing.assert_allclose(found.standard_error, result.standard_error, rtol=0.15)

@@ -82,16 +82,6 @@ def test_predicted_errors_come_true(known):
 
 
 @pytest.mark.slow
-def test_before_any_measurement_an_unknown_may_be_anywhere_between_its_bounds(result):
-    """Errors without data: the standard deviation of points even between the bounds."""
-    before, lanes = situation(result, with_data=False), result.study.lanes
-    for g, k in enumerate(before.lane):
-        even = np.linspace(lanes.lower[k], lanes.upper[k], 10_001).std(axis=0)
-        spread = before.relative[g] * np.diag(np.linalg.inv(before.base[g])) ** 0.5
-        np.testing.assert_allclose(spread, even, rtol=1e-3)
-
-
-@pytest.mark.slow
 @pytest.mark.compiling
 def test_information_of_a_candidate_is_that_of_finite_differences(known):
     """At s = 51 mm to 4 mm: central differences of `press`, with the noise of the study."""
@@ -132,22 +122,6 @@ def test_criteria_are_their_definitions_and_greedy_takes_the_best(known):
         assert np.all(np.diff(choice.error, axis=0) < 0)
     # Deeper is never worse: samples of a deeper press say more of every unknown.
     assert candidates.depth[next_points(known, candidates).chosen[0]] == 6.0
-
-
-@pytest.mark.slow
-def test_ten_thousand_candidates(known):
-    """More than are computed at a time; the error of every unknown falls."""
-    one = dataclasses.replace(
-        known, lane=known.lane[:1], theta=known.theta[:1], base=known.base[:1],
-        relative=known.relative[:1], sigma=known.sigma[:1], kept=known.kept[:1],
-        own=known.own[:1], prior=known.prior[:1], meat=known.meat[:1], factor=known.factor[:1],
-        weight=known.weight[:1],
-    )  # fmt: skip
-    candidates = grid((10.0, 150.0), (2.0, 6.0), 10_000)
-    assert len(candidates.s) == 10_000
-    choice = next_points(one, candidates)
-    assert choice.error.shape == (2, 4)
-    assert np.all(choice.error[1] < choice.error[0])
 
 
 def test_map_knows_that_one_place_is_not_enough(known):

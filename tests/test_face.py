@@ -186,23 +186,6 @@ def test_one_file_and_its_curves_are_a_study():
 
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_profiles_and_bootstrap_go_by_the_same_names():
-    """With little noise the model is linear: both agree with the local standard errors."""
-    force, _ = forces(TRUTH)
-    noisy = force + 1e-4 * force.max() * np.random.default_rng(1).normal(size=force.shape)
-    result = jt.fit(jt.build_study(curves(noisy), GEOMETRY, OPTIONS, parameters()), SETTINGS)
-    k_m = jt.profiles(result, SETTINGS, ["k_M"], points=2)
-    np.testing.assert_allclose(k_m.lower, result.lower[:, 1], rtol=0.01)
-    np.testing.assert_allclose(k_m.upper, result.upper[:, 1], rtol=0.01)
-    rows = result.table(k_m)
-    assert [r["low95"] for r in rows if r["parameter"] == "k_M"] == k_m.lower.tolist()
-    again = jt.bootstrap(result, SETTINGS, count=100)
-    # The standard deviation of 100 draws is known to 7 %; three times that.
-    np.testing.assert_allclose(again.standard_error, result.standard_error, rtol=0.22)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
 def test_a_fit_in_single_precision_is_said_once():
     """With the cure, at the user's line; not where float32 was asked for, nor in float64."""
     study = jt.build_study(curves(forces(TRUTH[:1])[0]), GEOMETRY, OPTIONS, parameters())

@@ -263,37 +263,6 @@ def test_a_bound_is_hit_and_said(noisy):
     assert np.isfinite(result.standard_error[:, 3]).all()
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_unequal_lengths_do_not_change_results():
-    """A short curve padded beside long ones gives what it gives alone."""
-    truth = synthetic.draw(11, 2, 1.2, CLEAR)
-    force, _ = synthetic.forces(truth)
-    force += 0.01 * np.random.default_rng(1).normal(size=force.shape)
-    long = synthetic.curves(force[:1])
-    short = [
-        dataclasses.replace(
-            c, specimen="short", displacement=c.displacement[:35], force=c.force[:35]
-        )
-        for c in synthetic.curves(force[1:])
-    ]
-
-    def make(data):
-        return build_study(
-            data,
-            synthetic.GEOMETRY,
-            synthetic.OPTIONS,
-            synthetic.parameters(),
-            weighting=Weighting(balance="sample"),
-        )
-
-    both = fit(make([*long, *short]), ONE)
-    alone = fit(make(short), ONE)
-    np.testing.assert_allclose(both.theta[1], alone.theta[0], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(both.standard_error[1], alone.standard_error[0], rtol=1e-8)
-    assert both.samples.tolist() == [200, 140]
-
-
 def test_more_starts_never_cost_more(noisy):
     _, force, _ = noisy
     one = fit(synthetic.study(force), ONE)

@@ -308,39 +308,6 @@ def test_rounding():
 
 
 @pytest.mark.slow
-def test_gradients():
-    """Forward = reverse = central differences through a path that sticks, slides and turns."""
-    x = np.array([0.0, 0.3, 1.9, 2.6, 1.2, -2.0])
-    point = {"D": sideways(x) + 0.1 * np.cos(np.arange(18)).reshape(6, 3), "C": COUPLED}
-    point |= {"k_1": 0.7, "k_3": 0.3, "mu": MU}
-
-    def f(v):
-        got = slide_path(v["D"], v["C"], Law(v["k_1"], v["k_3"]), Coulomb(v["mu"], 0.05))
-        return jnp.concatenate([got.force.ravel(), got.slip.ravel()])
-
-    here = {n: jnp.asarray(v) for n, v in point.items()}
-    quick = functools.partial(jax.jit, compiler_options=QUICK)
-    forward, reverse = quick(jax.jacfwd(f))(here), quick(jax.jacrev(f))(here)
-    value, rng = quick(f), np.random.default_rng(2)
-    slid = path(point["D"], COUPLED, 0.7, 0.3)
-    assert 0 < np.sum(slid.sliding) < 6
-    for name, v in point.items():
-        tolerance = 2e4 * np.finfo(float).eps * np.max(np.abs(forward[name]))
-        np.testing.assert_allclose(forward[name], reverse[name], atol=tolerance)
-        direction = rng.normal(size=np.shape(v))
-        if name == "C":
-            direction = direction + direction.T
-        up, down = (
-            value({n: jnp.asarray(p) for n, p in (point | {name: v + e * direction}).items()})
-            for e in (1e-6, -1e-6)
-        )
-        along = np.tensordot(forward[name], direction, np.ndim(v))
-        size = np.max(np.abs(along))
-        tolerance = max(tolerance, 1e-6 * size)
-        np.testing.assert_allclose(along, (up - down) / 2e-6, atol=tolerance, err_msg=name)
-
-
-@pytest.mark.slow
 def test_gradient_at_rest_is_finite():
     """No tangential motion, no pressure: nothing divides by the length of zero."""
     rounding = 0.0

@@ -12,20 +12,17 @@ import numpy as np
 import pytest
 
 from jaxtrachea import (
-    Beam,
     Curve,
     Material,
     Options,
     Poses,
     build_study,
-    deflect,
     make_scene,
     table_1,
 )
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.fitting.cost import evaluate
 from jaxtrachea.fitting.information import information
-from jaxtrachea.mechanics.reactions import deflect_dense
 from jaxtrachea.mechanics.sections.material import from_wall
 from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.scene import step
@@ -85,12 +82,6 @@ def stepped(s):
     return found.force, surface(scene(), *press), found.joints
 
 
-def dense(s):
-    x = SHORT.ring_positions
-    beam = Beam(x, SHORT.length, number([1.8, 1.8, 1.8]), number([0.1, 0.1]))
-    return deflect_dense(beam, s, number(1.0)).w_C, deflect(beam, s, number(1.0)).w_C
-
-
 def fit(theta):
     """Normal equations and information of a fit of a curve."""
     depth = np.linspace(0.1, 3, 5)
@@ -108,7 +99,6 @@ def fit(theta):
 CASES = [
     pytest.param(sections(1.5), id="sections, off the midline", marks=pytest.mark.slow),
     pytest.param(stepped, id="session", marks=pytest.mark.slow),
-    pytest.param(dense, id="beam", marks=pytest.mark.slow),
     pytest.param(fit, id="fit"),
 ]
 

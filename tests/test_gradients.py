@@ -81,14 +81,6 @@ def _beam(v):
     return Beam(v["x"], v["length"], v["EI"], v["k"], v.get("GA"))
 
 
-def compliance(v):
-    return contact_compliance(_beam(v), v["s"])
-
-
-def compliance_independent(v):
-    return contact_compliance(_beam(v), v["s"], split="independent")
-
-
 @functools.cache
 def deflection(split, form, loaded=False):
     def f(v):
@@ -96,14 +88,6 @@ def deflection(split, form, loaded=False):
         return deflect(_beam(v), v["s"], v["force"], split=split, form=form, ring_load=load)
 
     return f
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-@pytest.mark.parametrize("f", [compliance, compliance_independent])
-def test_compliance(f):
-    for s, k in ((25.3, 1e-9), (5.5, 0.1), (25.3, 1e12)):
-        check(f, beam_values(s, k), rtol=3e-6)
 
 
 @pytest.mark.slow

@@ -10,10 +10,8 @@ import pytest
 from admitted import BEAM, FULL
 
 from jaxtrachea.mechanics import beam
-from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
 from jaxtrachea.mechanics.press import Options, press
-from jaxtrachea.mechanics.vector_equilibrium import press_vector_total
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.simulation import simulate
@@ -145,20 +143,3 @@ def test_a_place_off_the_beam_says_nothing_of_the_beam():
         assert all(np.any(v != 0) for v in alone)
         for p, q in zip(found, alone, strict=True):
             np.testing.assert_allclose(p, q, rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_a_vector_that_is_no_number_says_nothing_of_the_skeleton():
-    """The printed coupling, row by row."""
-    D = jnp.array([[1.0, 0.2, 0.1], [np.nan, 0, 0]])
-
-    def force(k_1, C, D):
-        solve = jax.vmap(press_vector_total, (0, None, None))
-        found = solve(D, C, Law(k_1, jnp.asarray(0.1)))
-        return jnp.sum(found.force[0]) + jnp.sum(found.depth[0])
-
-    found, alone = (jax.grad(force, (0, 1))(0.8, jnp.eye(3), v) for v in (D, D[:1]))
-    for p, q in zip(found, alone, strict=True):
-        np.testing.assert_allclose(p, q, rtol=1e-13)
-    status = press_vector_total(D[1], jnp.eye(3), Law(jnp.asarray(0.8), jnp.asarray(0.1))).status
-    assert status == PressStatus.NON_FINITE

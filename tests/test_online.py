@@ -3,7 +3,6 @@
 import dataclasses
 
 import compilations
-import jax
 import numpy as np
 import pytest
 import synthetic
@@ -236,24 +235,6 @@ def test_samples_that_are_refused(run):
             one.add(d, f)
     assert one.state.samples == 0
     assert one.curves == []
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_in_single_precision(run):
-    """Within what rounding of the forces moves: 1e-7 times the norm of force over sigma, in se."""
-    exact, force = run[2], measured()
-    with jax.enable_x64(False):
-        with pytest.warns(UserWarning, match="computes in float32"):
-            one = online()
-        pressed(one, force)
-        settled = one.settle()
-    assert settled.status == FitStatus.CONVERGED
-    off = (np.log(settled.value) - np.log(exact.value)) / exact.relative_error
-    rounding = np.finfo(np.float32).eps * np.linalg.norm(force) / SIGMA
-    assert rounding < 1e-3
-    assert np.max(np.abs(off)) < 10 * rounding
-    np.testing.assert_allclose(settled.covariance, exact.covariance, rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -15,11 +15,10 @@ from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out, without
+from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.design.candidates import Candidates, check
 from jaxtrachea.inference.design.choice import gains
 from jaxtrachea.inference.design.situation import situation
-from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.inference.weakest_direction import describe_weakest
@@ -247,25 +246,6 @@ def test_a_stiffness_of_one_curve_is_still_refused():
     study = own_study(0.05, k_1={"scope": "trial"})
     with pytest.raises(ValueError, match="k_1 belongs to single trials"):
         curves_to_leave_out(study)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_influence_of_a_curve_with_its_own_onset(owned):
-    """First order against the refit without the curve; what goes with the curve is a dash."""
-    found = influence(owned).of
-    study = owned.study
-    names = [p.name for p in study.free]
-    own = [names.index(n) for n in ("onset", "force_offset")]
-    common = [names.index(n) for n in ("k_1", "k_3")]
-    assert np.isnan(found.curve_left_out[:, :, own]).all()
-    held = np.zeros(study.lanes.s_c.shape, bool)
-    held[:, 1] = True
-    again = fit(without(study, held), ONE)
-    moved = (again.theta - owned.theta)[:, common]
-    se = owned.uncertainty.se[:, common]
-    np.testing.assert_allclose(found.curve_left_out[:, 1, common], moved / se, atol=0.1)
-    assert np.all((found.curve_cook > 0) & (found.curve_cook < 5))
 
 
 def test_a_new_press_brings_its_own_onset(owned):

@@ -40,12 +40,6 @@ def stiffness(read, lane):
     return [p.from_scaled(v) for p, v in pairs]
 
 
-def without_covariance(read):
-    """The same fit, sure of what it keeps."""
-    local = read.uncertainty._replace(covariance=np.zeros_like(read.uncertainty.covariance))
-    return dataclasses.replace(read, uncertainty=local)
-
-
 OWN = {"onset": {"fixed": False}, "force_offset": {"fixed": False}}
 
 
@@ -162,32 +156,6 @@ def least_touch(read, lane, curve):
 
     found = least_squares(lambda x: force(x) - curve.force, [0.5, 0.0], x_scale="jac")
     return found.x, force(found.x)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_own_onset_of_a_press_of_another_size(touched):
-    """Steps follow the presses: one ten times as deep has others, and the same millimetres."""
-    _, read = touched
-    (deep,) = touching((3.0,), 60.0, ("T1",))
-    deep = dataclasses.replace(deep, trial="deep")
-    onset = next(p for p in read.study.free if p.name == "onset")
-    (found,) = held_out.compare(read, [deep])
-    x, force = least_touch(read, 0, deep)
-    assert onset.step == 1.0
-    assert abs(x[0] - 3.0) < 0.2
-    assert np.max(np.abs(found.prediction.force - force)) < 1e-3 * np.max(deep.force)
-    # The band with nothing but the curve's own errors: SciPy's Jacobian, no kept covariance.
-    bare = without_covariance(read)
-    (found,) = held_out.compare(bare, [deep])
-    D = deep.displacement
-    k_1, k_3 = stiffness(read, 0)
-    z = np.maximum(D - x[0], 0)
-    J = np.stack([-(k_1 + 3 * k_3 * z**2) * (z > 0), np.ones_like(D)])
-    own = read.observed_sigma[0, 0] ** 2 * np.linalg.inv(J @ J.T)
-    expected = np.sqrt(np.einsum("in,ij,jn->n", J, own, J))
-    away = np.abs(D - x[0]) > 1.5
-    assert np.allclose(found.prediction.se[away], expected[away], rtol=0.02)
 
 
 def rounded(x, width):

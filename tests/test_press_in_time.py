@@ -49,12 +49,11 @@ def run(material, relaxes, options, time=TIMES, way=WAY, s_c=22.0):
 @pytest.mark.parametrize(
     ("change", "material"),
     [
-        ({}, QUINTIC),
         ({"local": "two-material"}, dataclasses.replace(QUINTIC, k_1_ring=jnp.asarray(2.0))),
         ({"contact": "bonded"}, QUINTIC),
         ({"skeleton": "softening"}, Material(**VALUES, e_1=0.08, e_2=0.003)),
     ],
-    ids=["quintic", "two-material", "bonded", "softening"],
+    ids=["two-material", "bonded", "softening"],
 )
 def test_parts_that_relax_alike_are_the_uniform_level(change, material):
     """With lift-off and recovery; two programs that share no equilibrium."""

@@ -76,7 +76,7 @@ READ = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("which", ["press", *late("path", "skeleton")])
+@pytest.mark.parametrize("which", ["press", *late("skeleton")])
 def test_statuses_in_a_batch(which):
     """Off the tube and each negative stiffness in turn: NaN with a status of their own.
 

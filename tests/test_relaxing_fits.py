@@ -73,12 +73,3 @@ def test_the_record_of_a_microscope_is_fitted_by_two_branches(tmp_path, monkeypa
     with (out / "summary.csv").open(newline="") as stream:
         (summary,) = csv.DictReader(stream)
     assert float(summary["rms_over_peak"]) == pytest.approx(known["rms_over_peak"], rel=0.05)
-
-
-@pytest.mark.slow
-def test_two_branches_predict_a_withdrawal_that_an_elastic_press_does_not():
-    script = load(AFM / "held_out.py")
-    known = json.loads((AFM / "expected.json").read_text())["predicted"]
-    for law, expected in known.items():
-        assert script.errors(law, script.record())[1] == pytest.approx(expected, rel=0.1)
-    assert known["prony-2"] < 0.2 * known["off"]

@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import io
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib as mpl
@@ -13,7 +12,6 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import Progress
-from run_cli import run
 
 from jaxtrachea.cli.scene import _print_rows
 from jaxtrachea.cli.terminal import Stages, progress_bar
@@ -389,35 +387,6 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
         assert place in where
     assert "1 of 1 fits solved, 0 with every unknown determined" in text
     assert summary_rows(widened(result))[0]["determined"] == 0
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
-    """Two `$` ended the run in a traceback; leaving out and influence reach the terminal."""
-    monkeypatch.chdir(tmp_path)
-    rows = ["specimen,trial,displacement [mm],force [N]"]
-    for i, name in enumerate(("$a$ $b$", r"$\frac{$", "=1+1")):
-        for t in "xy":
-            one = curve(name, t, noise=0.01, seed=2 * i + (t == "y"))
-            pairs = zip(one.displacement.tolist(), one.force.tolist(), strict=True)
-            rows += [f"{name},{t}$,{d!r},{f!r}" for d, f in pairs]
-    Path("d.csv").write_text("\n".join(rows) + "\n")
-    Path("s.toml").write_text(
-        'title = "$t$"\n[data]\nfiles = "d.csv"\n[model]\ncoupling = "total"\n[fit]\nstarts = 1\n'
-    )
-    code, out, err = run(
-        monkeypatch, capsys, "fit", "s.toml", "--leave-one-out", "--influence", "--out", "o"
-    )
-    assert code == 0, err
-    assert "Leaving one curve out" in out
-    assert "Influence of curves" in out
-    names = {p.name for p in Path("o").iterdir()}
-    assert {"fit.png", "left_out.png", "correlation.png", "left_out.csv"} <= names
-    assert len(read_csv(Path("o/left_out.csv"))) == 6
-    parameters = read_csv(Path("o/parameters.csv"))
-    assert {row["specimen"] for row in parameters} == {"$a$ $b$", r"$\frac{$", "=1+1"}
-    assert all(float(row["low95"]) <= float(row["low95_independent"]) for row in parameters)
 
 
 @pytest.mark.slow

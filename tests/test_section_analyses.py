@@ -1,6 +1,5 @@
 """Analyses of fits of deforming cross-sections, against refits by SciPy on single presses."""
 
-import csv
 import dataclasses
 import functools
 from pathlib import Path
@@ -24,7 +23,6 @@ from jaxtrachea.inference.design.choice import next_points
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import _external, influence
 from jaxtrachea.inference.profile import profiles
-from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
@@ -275,26 +273,6 @@ def test_influence_is_that_of_refits():
     )
 
 
-@pytest.mark.slow
-def test_leaving_positions_out_is_by_angle_too(result):
-    """Of a position pressed at two angles one is left out; against SciPy's fits of the others."""
-    curves = result.study.curves[0]
-    assert PLACES[0][0] == PLACES[2][0]
-    missed = leave_repeats_out(result, ONE)
-    assert missed.refits[0] == 3
-    assert missed.lost[0] == missed.unconverged[0] == 0
-    keep = np.ones((3, 2, len(PATH)), bool)
-    keep[:2, 1] = False
-    off = []
-    for t, c in enumerate(curves):
-        without = keep.copy()
-        without[t] = False
-        theta = perturbed(curves, without, np.zeros(keep.shape), SIGMA)
-        off.append(shown(theta)[t, 0] - c.force)
-    wanted = np.sqrt(np.mean(np.square(off))) / max(np.max(np.abs(c.force)) for c in curves)
-    np.testing.assert_allclose(missed.error[0], wanted, rtol=1e-4)
-
-
 SPEC = """title = "{title}"
 [data]
 files = "{files}"
@@ -327,37 +305,6 @@ def specification(title, files="data.h5", more=""):
 
 def stored(path, curves):
     write_hdf5(path, Measurements(tuple(curves), (), ()))
-
-
-@pytest.mark.slow
-def test_command_compares_sections_with_lines(tmp_path, monkeypatch, capsys):
-    """Curves of sections on the midline: AICc and left-out error by SciPy; the line is far off."""
-    monkeypatch.chdir(tmp_path)
-    places = ((15.0, 0.0), (8.0, 0.0), (12.0, 0.0))
-    monkeypatch.setitem(globals(), "PLACES", places)
-    curves = measured(4)
-    stored("data.h5", curves)
-    for title in ("linear", "sections"):
-        Path(f"{title}.toml").write_text(specification(title))
-    code, out, _ = run(monkeypatch, capsys, "compare", "linear.toml", "sections.toml", "--out", "o")
-    assert code == 0
-    assert "one: the data prefer sections decisively" in " ".join(out.split())
-    with Path("o/compare.csv").open(newline="") as stream:
-        rows = {row["model"]: row for row in csv.DictReader(stream)}
-    theta, cost = refit(curves)
-    n, k = 18, 2
-    AICc = 2 * cost + n * np.log(2 * np.pi * SIGMA**2) + 2 * k + 2 * k * (k + 1) / (n - k - 1)
-    assert float(rows["sections"]["AICc"]) == pytest.approx(AICc, rel=1e-6)
-    keep = np.zeros((3, 2, len(PATH)), bool)
-    off = []
-    for t in range(3):
-        keep[:, 0] = (np.arange(3) != t)[:, None]
-        theta = perturbed(curves, keep, np.zeros(keep.shape), SIGMA)
-        off.append(shown(theta)[t, 0] - curves[t].force)
-    wanted = np.sqrt(np.mean(np.square(off))) / max(np.max(np.abs(c.force)) for c in curves)
-    assert float(rows["sections"]["left_out"]) == pytest.approx(wanted, rel=1e-4)
-    # Neither the angle nor the width of the wall is in the line: it cannot fit what sections show.
-    assert float(rows["linear"]["left_out"]) > 5 * wanted
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ DOCUMENT = Path(__file__).parents[1] / "docs" / "evidence" / "hard_cases.md"
 #: Functions whose programs compile at once; the others are slow tests.
 QUICK = ("series", "quintic", "first_touch", "axial")
 #: Their programs are those of users; the others are compiled without optimisation.
-OPTIMISED = ("vector", "press_9", "beam", "contacts")
+OPTIMISED = ("vector", "beam")
 
 
 def wrong(outcomes):

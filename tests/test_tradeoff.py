@@ -16,7 +16,6 @@ from tradeoff_page import choice_rows, fronts
 from tradeoff_plots import QUESTIONS, draw
 from tradeoff_scene import DEPTH, K_1, K_3, SCENE, TOML
 
-from jaxtrachea.config import SpecError
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.effects import EFFECTS
@@ -189,36 +188,6 @@ def test_ladders_of_a_scene_and_why_others_are_left_out():
     assert (kinds["form"], kinds["dtype"], kinds["shear"]) == ("algebra", "truncation", "model")
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_ladder_of_the_skeleton():
-    """Linear instead of softening errs as by hand; coupling is not climbed; vectors have none."""
-    law = {"e_1": "0.1 1/mm", "e_2": "0.005 1/mm^2", "k_1": "1e6 N/mm", "k_3": "0 N/mm^3"}
-    plain = {name: v for name, v in SCENE["material"].items() if name not in ("k_1_ring", "GA_L")}
-    full = full_scene(*staged(SCENE | {"material": plain}, **law))
-    found, out = ladders(full)
-    ladder = next(v for v in found if v.name == "skeleton")
-    assert (list(ladder.rungs), ladder.kind) == (["linear", "softening"], "model")
-    assert out["coupling"] == "a skeleton that softens needs coupling 'series'"
-    assert "coupling" not in {v.name for v in found}
-    soft, linear = (
-        jax.jit(simulate)(*program(full, ladder.levels(full, rung))).force[-1, 1]
-        for rung in ("softening", "linear")
-    )
-    # Rigid contact: g(D) against D.
-    assert soft / linear == pytest.approx(1 - 0.1 * DEPTH + 0.005 * DEPTH**2, rel=1e-5)
-    with pytest.raises(SpecError, match="effects.skeleton: 'auto'.*second plane"):
-        staged(SCENE | {"effects": {"second_plane": "on"}}, **law)
-    # A shallow press: the rules take the linear one, the finest is what softens.
-    spec = SCENE | {"path": SCENE["path"] | {"displacement": ["0 mm", "-0.1 mm", "0 mm"]}}
-    spec, made = staged(spec | {"material": plain}, **law)
-    assert made.scene.plan.level("skeleton") == "linear"
-    full = full_scene(spec, made)
-    assert full.levels.plan.level("skeleton") == "softening"
-    assert choose(full, 0.02).levels.plan.level("skeleton") == "linear"
-    assert choose(full, 0.002).levels.plan.level("skeleton") == "softening"
-
-
 def test_the_finest_level_is_no_wish_of_the_user():
     arch = {"EI_C": "13 N mm^2", "k_t": "0.4 N/mm"}
     said = {e.name: e for e in full_scene(*staged(**arch)).scene.plan.effects}
@@ -312,36 +281,6 @@ def test_chosen_plan_is_within_the_tolerance():
     assert not choice.restored
     assert "no program but the full one is within 1e-08 %" in choice.sentence
     assert choice.cost.share == 1
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_two_effects_within_tolerance_can_break_it_together():
-    spec, made = staged(GA_L="10 N")
-    full = full_scene(spec, made)
-    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
-    options = made.scene.plan.options
-
-    def plan(**less):
-        return (dataclasses.replace(
-        made.scene, plan=dataclasses.replace(
-            made.scene.plan, options=dataclasses.replace(options, **less),
-            ignored=frozenset({"shear", "two_material"}))))  # fmt: skip
-
-    kept = {"precision": "float64"}
-    loose = choose(full, 0.1, **kept)
-    alone = {rung.ladder: rung.errors.worst for rung in loose.dropped}
-    assert loose.errors.worst > max(alone.values())
-    tolerance = (loose.errors.worst + max(alone.values())) / 2
-    choice = choose(full, tolerance, **kept)
-    assert len(choice.dropped) == len(choice.restored) == 1
-    saved = {rung.ladder: rung.saved for rung in loose.dropped}
-    assert choice.restored[0].ladder == max(alone, key=lambda k: alone[k] / saved[k])
-    assert choice.errors.worst <= tolerance
-    reference = solve(full.scene, made.material, made.path)
-    both = solve(plan(shear=False, local="uniform"), made.material, made.path)
-    assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
-    assert off(both, reference) > 0
 
 
 def test_a_tolerance_needs_something_to_be_measured_by():

@@ -243,33 +243,6 @@ def test_what_is_timed_of_a_tool_is_its_step():
         assert found.status == expected.status
 
 
-@pytest.mark.slow
-def test_plan_says_what_was_made_least(tmp_path, monkeypatch, capsys):
-    path = tmp_path / "scene.toml"
-    path.write_text(TOML + '[plan]\ntolerance = "10 %"\ncost = "path"\n')
-    code, out, _ = run(monkeypatch, capsys, "plan", path, "--time")
-    out = " ".join(out.split())
-    assert code == 0
-    assert "time measured on this machine: " in out
-    assert "ms for the whole path in one call, " in out
-    none = "nothing that is within 10 % surely saves time" in out  # where noise hides it
-    assert none or "measured here for the whole path in one call: " in out
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_loops_that_end_when_they_have_converged_have_a_time(tmp_path, monkeypatch, capsys):
-    """A quintic law, whose Newton solve does: no number of operations is its time."""
-    path = tmp_path / "scene.toml"
-    quintic = TOML.replace("[model]", 'k_5 = "0.001 N/mm^5"\n[model]')
-    path.write_text(quintic + '[plan]\ntolerance = "10 %"\ncost = "step"\n')
-    code, out, _ = run(monkeypatch, capsys, "plan", path, "--time")
-    out = " ".join(out.split())
-    assert code == 0
-    assert "time measured on this machine: " in out
-    assert "surely saves time" in out or "measured here for one pose a call: " in out
-
-
 def test_a_bad_word_for_the_cost(tmp_path, monkeypatch, capsys):
     path = tmp_path / "scene.toml"
     path.write_text(TOML + '[plan]\ntolerance = "10 %"\ncost = "lane"\n')

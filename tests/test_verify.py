@@ -246,14 +246,13 @@ def test_no_doubt_costs_nothing(study, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.compiling
 def test_truth_table():
-    """100 specimens at 0.2 and 2 % noise: at most 5 % have an unknown falsely identifiable.
+    """50 specimens at 0.2 and 2 % noise: at most 5 % have an unknown falsely identifiable.
 
     Of two presses. False: identifiable, more than 10 % off and outside the interval of 99.7 %.
     Truths and noise are not those that the thresholds were chosen with (seeds 100 and 107).
     """
-    pressed = specimens.press(specimens.draw(2024, 100), RINGS, LENGTH, POSITIONS[:2])
+    pressed = specimens.press(specimens.draw(2024, 50), RINGS, LENGTH, POSITIONS[:2])
     rng = np.random.default_rng(2025)
     data = [c for share, name in ((0.002, "a"), (0.02, "b"))
             for c in curves(pressed, 2, share, rng, name)]  # fmt: skip
@@ -261,7 +260,7 @@ def test_truth_table():
     assert found.succeeded.all()
     word, _, false = verdicts(found, np.tile(pressed.truth, (2, 1)))
     identifiable = word == "identifiable"
-    for part in (slice(100), slice(100, 200)):
+    for part in (slice(50), slice(50, 100)):
         wrong = (identifiable & false)[part]
         assert wrong.any(axis=1).mean() <= 0.05
         assert wrong.sum() <= 0.05 * max(identifiable[part].sum(), 20)
@@ -281,17 +280,14 @@ def joint_study(seed, shared, count, share):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize(
-    ("seeds", "shared", "count"), [((1,), ("EI_L",), 2), (range(4), ("k_1", "k_3"), 2)]
-)
-def test_a_joint_fit_says_what_it_has_not_looked_at(seeds, shared, count):
+def test_a_joint_fit_says_what_it_has_not_looked_at():
     """No wrong unknown is identifiable; with local errors alone 7 of 8, 30 of 53, 9 of 21 were.
 
     All come to rest, also where an unknown is best at infinity (seed 2 had stalled).
     """
     words = []
-    for seed in seeds:
-        study, truth = joint_study(seed, shared, count, 0.002)
+    for seed in range(4):
+        study, truth = joint_study(seed, ("k_1", "k_3"), 2, 0.002)
         result = fit(study, Settings(starts=4))
         assert np.all(result.status <= FitStatus.UNIDENTIFIABLE), seed
         word, _, false = verdicts(result, truth)

@@ -137,7 +137,7 @@ def cloud(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
     Raises:
         ValueError: not an (n, 3) array, or a radius below zero.
     """
-    vertices = _on_host(jnp.asarray(points, dtype))
+    vertices = _numbers(points, dtype)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.shape[0] == 0:
         raise ValueError(f"points: expected shape (n, 3) with n >= 1, found {vertices.shape}")
     if not isinstance(vertices, Tracer):
@@ -187,8 +187,8 @@ def sphere(radius: ArrayLike, dtype=None) -> Shape:
         radius: mm, not negative.
         dtype: of the shape; default JAX's default.
     """
-    r = jnp.asarray(radius, dtype)
-    return _shape(np.zeros((3, 1), jnp.result_type(r, float) if dtype is None else dtype), r)
+    dtype = jnp.result_type(radius, float) if dtype is None else dtype
+    return _shape(np.zeros((3, 1), dtype), radius)
 
 
 def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
@@ -199,8 +199,8 @@ def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
         radius: mm, not negative.
         dtype: of the shape; default that of `half_length`.
     """
-    half = jnp.asarray(half_length, dtype)
-    half = _on_host(jnp.asarray(half, jnp.result_type(half, float) if dtype is None else dtype))
+    dtype = jnp.result_type(half_length, float) if dtype is None else dtype
+    half = _numbers(half_length, dtype)
     return _shape(half * np.array([[0, 0], [0, 0], [-1, 1]], half.dtype), radius)
 
 
@@ -213,7 +213,7 @@ def box(half_sizes: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
             of the normal reach beta times the size: round what you differentiate.
         dtype: of the shape; default that of `half_sizes`.
     """
-    half = _on_host(jnp.asarray(half_sizes, dtype))
+    half = _numbers(half_sizes, dtype)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)
     return _shape(half[:, None] * signs.astype(half.dtype), radius)
 
@@ -243,8 +243,8 @@ def cylinder(
     """
     if sides < 3:
         raise ValueError(f"sides: expected at least 3, found {sides}")
-    r = _on_host(jnp.asarray(disc_radius, dtype))
-    half = _on_host(jnp.asarray(half_length, r.dtype))
+    r = _numbers(disc_radius, dtype)
+    half = _numbers(half_length, r.dtype)
     turn, none = 2 * math.pi / sides * np.tile(np.arange(sides), 2), np.zeros(2 * sides)
     across = np.stack([np.cos(turn), np.sin(turn), none]).astype(r.dtype)
     along = np.stack([none, none, np.repeat([-1.0, 1.0], sides)]).astype(r.dtype)
@@ -285,12 +285,7 @@ def compound(shapes: Sequence[Shape], poses: Sequence[Pose] | None = None) -> Sh
     most = max(part.vertices.shape[1] for part in found)
     if any(part.vertices.shape[1] < most or part.counts is not None for part in found):
         found = [padded(part, most) for part in found]
-
-    def stacked(*parts):
-        traced = any(isinstance(v, Tracer) for v in parts)
-        return jnp.stack(parts) if traced else jnp.asarray(np.stack(parts))
-
-    return jax.tree.map(stacked, *found)
+    return jax.tree.map(lambda *v: _array(_numbers(v)), *found)
 
 
 def parts_of(shape: Shape) -> list[Shape]:
@@ -298,8 +293,7 @@ def parts_of(shape: Shape) -> list[Shape]:
     if shape.vertices.ndim == 2:
         return [shape]
     parts = [
-        jax.tree.map(lambda v, i=i: jnp.asarray(_on_host(v)[i]), shape)
-        for i in range(len(shape.radius))
+        jax.tree.map(lambda v, i=i: _array(_numbers(v)[i]), shape) for i in range(len(shape.radius))
     ]
     return [_unpadded(part) for part in parts]
 
@@ -308,13 +302,13 @@ def _unpadded(shape: Shape) -> Shape:
     """Without the vertices that do not count, where that is known."""
     if shape.counts is None or isinstance(shape.counts, Tracer):
         return shape
-    kept = _on_host(shape.vertices)[:, np.asarray(shape.counts) > 0]
-    return Shape(jnp.asarray(kept), shape.radius)
+    kept = _numbers(shape.vertices)[:, np.asarray(shape.counts) > 0]
+    return Shape(_array(kept), shape.radius)
 
 
 def _moved(shape: Shape, pose: Pose) -> Shape:
     """A shape in another frame."""
-    return dataclasses.replace(shape, vertices=transform(pose, shape.vertices))
+    return dataclasses.replace(shape, vertices=jax.jit(transform)(pose, shape.vertices))
 
 
 def padded(shape: Shape, count: int) -> Shape:
@@ -333,21 +327,28 @@ def padded(shape: Shape, count: int) -> Shape:
     if count < present:
         raise ValueError(f"count: expected at least {present} (the vertices), found {count}")
     again = np.arange(count)
-    counts = np.ones(present) if shape.counts is None else _on_host(shape.counts)
-    counts = counts[again % present] * (again < present)
-    vertices = _on_host(shape.vertices)[:, again % present]
-    return Shape(jnp.asarray(vertices), shape.radius, jnp.asarray(counts, vertices.dtype))
+    vertices = _numbers(shape.vertices)[:, again % present]
+    counts = (again < present).astype(vertices.dtype)
+    if shape.counts is not None:
+        counts = counts * _numbers(shape.counts)[again % present]
+    return Shape(_array(vertices), shape.radius, _array(counts))
 
 
-def _on_host(value):
-    """In NumPy, where it is not traced: in JAX each operation would be a program of its own."""
-    return value if isinstance(value, Tracer) else np.asarray(value)
+def _numbers(value, dtype=None):
+    """Of NumPy, where they are not traced: each operation of JAX would be compiled by itself."""
+    if any(isinstance(v, Tracer) for v in jax.tree.leaves(value)):
+        return jnp.asarray(value, dtype)
+    host = np.asarray(value)
+    return host.astype(jax.dtypes.canonicalize_dtype(host.dtype if dtype is None else dtype))
+
+
+def _array(value) -> Array:
+    return value if isinstance(value, Array) else jax.device_put(value)
 
 
 def _shape(vertices, radius) -> Shape:
     """Common dtype and the check of the radius, where it is a number."""
-    vertices = jnp.asarray(vertices)
-    r = jnp.asarray(radius, vertices.dtype)
+    r = _numbers(radius, vertices.dtype)
     if not isinstance(r, Tracer) and np.any(np.asarray(r) < 0):
         raise ValueError(f"radius: expected a length not below 0, found {radius}")
-    return Shape(vertices, r)
+    return Shape(_array(vertices), _array(r))

@@ -326,7 +326,7 @@ def _tool(
         shape, seen = _shape(part, f"{key}.parts.{i}", folder, files)
         turn, place = part.rotation or [0.0] * 3, part.position or [0.0] * 3
         found.append(jax.tree.map(lambda v: jnp.asarray(v, float), shape))
-        poses.append(pose_from_vector(jnp.asarray(turn, float), jnp.asarray(place, float)))
+        poses.append(jax.jit(pose_from_vector)(np.asarray(turn, float), np.asarray(place, float)))
         notes += seen
     try:
         return shapes.compound(found, poses), notes

@@ -219,10 +219,14 @@ ROWS = {
 }  # fmt: skip
 #: Long to compile, of a kind that another row is of too.
 SLOW = (
-    "press_oblique",
     "press_path",
     "skeleton_response",
     "press, softening",
     "press, two materials",
 )
-EACH = [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in ROWS]
+#: A path has an oblique press in it.
+EACH = [
+    pytest.param(n, marks=pytest.mark.slow if n in SLOW else ())
+    for n in ROWS
+    if n != "press_oblique"
+]

@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
@@ -13,16 +12,12 @@ from noisy_fits import DEPTHS, true_force
 from run_cli import run, tree
 
 import jaxtrachea
-from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.predictions import predictions
-from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.measurements.presses import parse_presses
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction import plots as prediction_plots
 
 ROOT = Path(__file__).parents[2]
-VIRTUAL = ROOT / "fits" / "virtual_trachea"
 COLUMNS = ("specimen", "trial", "s [mm]", "phi [deg]", "tilt [deg]", "displacement [mm]",
            "force [N]", "predicted [N]", "low95 [N]", "high95 [N]")  # fmt: skip
 
@@ -309,48 +304,3 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
     assert says in " ".join(err.split())
     assert "Traceback" not in err
     assert tree(tmp_path) == before
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, capsys):
-    """The command on fits of nine positions predicts the tenth as `--leave-one-out` does.
-
-    Ten specimens of nine curves in one file: each is a fit of its own.
-    """
-    from jaxtrachea.cli.specification import settings_of, study_of
-    from jaxtrachea.config import load_fit_spec
-    from jaxtrachea.measurements.data_files import read_data
-    from jaxtrachea.measurements.read import Measurements, write_hdf5
-
-    spec = load_fit_spec(VIRTUAL / "fit.toml")
-    measured = read_data(spec, VIRTUAL)
-    study = study_of(spec, measured, refits=True)
-    left = leave_one_out(fit(study, settings_of(spec)), settings_of(spec))
-    truth = predictions(study.take(left.lane), left.result.theta).force
-    out = [study.curves[lane][trial] for lane, trial in zip(left.lane, left.trial, strict=True)]
-    assert len(out) == 10
-    parts = {"nine": [], "tenth": []}
-    for tenth in out:
-        for c in measured.curves:
-            name = "tenth" if c.trial == tenth.trial else "nine"
-            parts[name].append(dataclasses.replace(c, specimen=f"without {tenth.trial}"))
-    for name, curves in parts.items():
-        write_hdf5(tmp_path / f"{name}.h5", Measurements(tuple(curves), (), ()))
-    text = (VIRTUAL / "fit.toml").read_text()
-    (tmp_path / "fit.toml").write_text(text.replace("small_strain.h5", "nine.h5"))
-    code, _, err = run(monkeypatch, capsys, "fit", tmp_path / "fit.toml", "--out", tmp_path / "f")
-    assert code == 0, err
-    code, _, err = run(
-        monkeypatch, capsys, "predict", tmp_path / "f", "--data", tmp_path / "tenth.h5",
-        "--out", tmp_path / "p",
-    )  # fmt: skip
-    assert code == 0, err
-    rows = rows_of(tmp_path / "p" / "predictions.csv")
-    for k, (trial, tenth) in enumerate(zip(left.trial, out, strict=True)):
-        own = [r for r in rows if r["specimen"] == f"without {tenth.trial}"]
-        assert {r["trial"] for r in own} == {tenth.trial}
-        assert len(own) > 1
-        mine = [float(r["predicted [N]"]) - float(r["force [N]"]) for r in own]
-        assert np.allclose(mine, truth[k, trial][: len(own)], rtol=0, atol=1e-9), k
-    assert json.loads((tmp_path / "f" / "provenance.json").read_text())["inputs"]

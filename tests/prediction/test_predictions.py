@@ -336,18 +336,6 @@ def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_pat
     assert np.all(np.abs(found.residual[again.displacement > 0.6]) < 2 * near + 1e-9)
 
 
-@pytest.mark.slow
-def test_a_zero_on_a_logarithmic_scale_is_none_for_a_new_press(tmp_path):
-    """No number has the logarithm of 0; a new press began at 1 mm."""
-    curves = recorded_study("fixed").curves[0]
-    own = {"fixed": False, "scope": "trial", "scale": "log", "lower": 0.01, "upper": 2.0}
-    more = {"onset": own | {"value": 0.4}, "force_offset": {"fixed": True, "value": 0.3}}
-    read = stored_again(total_study(curves, more, noise=Noise(force=0.01)), tmp_path / "r.h5")
-    new = jaxtrachea.predict(read, s=80.0, displacement=[1.0, 2.0])
-    np.testing.assert_allclose(new.force, law(np.array([1.0, 2.0])), rtol=2e-3)
-    assert np.all(np.isfinite(new.se) & (new.se > 0) & (new.se < 0.01))
-
-
 def test_change_points_serve_before_a_fit_and_numbers_that_are_held_as_they_are():
     for onset, offset in (({}, {}), ({"fixed": True, "value": 10.2}, {})):
         study = late_study(onset, offset)

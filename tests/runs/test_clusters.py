@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from interrupted import finish, numbers, start
+from interrupted import numbers
 from run_cli import run, tree
 from stopped import FIT, begun, set_failed
 
@@ -67,17 +67,6 @@ def test_a_cluster_that_is_not_there(study, monkeypatch, capsys):
     code, _, err = run(monkeypatch, capsys, *FIT, "--scheduler", "h:1", "--threads", "2")
     assert code == 2
     assert "--threads is of this process" in err
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_two_devices(peace, study):
-    # Added to those of `peace`: other code for the same sums rounds otherwise.
-    devices = "--xla_force_host_platform_device_count=2"
-    flags = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {devices}"}
-    code, _, err = finish(start(study, *FIT[:3], "devices", **flags))
-    assert code == 0, err
-    assert numbers(study / "devices") == numbers(peace / "out")
 
 
 HOLD = """

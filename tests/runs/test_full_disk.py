@@ -8,7 +8,7 @@ import sys
 
 import pytest
 from full_disk import Disk
-from interrupted import numbers, programs_kept
+from interrupted import numbers
 from run_cli import run, tree
 from stopped import FIT, begun, from_peace, set_failed
 
@@ -87,34 +87,3 @@ except OSError as error:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "File too large\n", "")
     assert not any(tmp_path.iterdir())
-
-
-FILL = """
-set -e
-mount -t tmpfs -o size=$SIZE tmpfs disk
-"$@" fit spec.toml --out disk/out && exit 9 || echo "first $?"
-mount -o remount,size=20m disk
-"$@" fit spec.toml --out disk/out $(test -d disk/out/.run && echo --resume)
-cp -r disk/out done
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_a_disk_that_is_really_full(peace, study):
-    """A tiny file system of its own, filled by the run and then enlarged."""
-    own = ["unshare", "--user", "--map-root-user", "--mount"]
-    if shutil.which("unshare") is None or subprocess.run([*own, "true"]).returncode:
-        pytest.skip("no file systems of one's own here")
-    (study / "disk").mkdir()
-    command = [*own, "sh", "-c", FILL, "sh", sys.executable, "-m", "jaxtrachea"]
-    # What is compiled lies beside the full disk, and is there for the next size.
-    kept = programs_kept(peace) | {"SIZE": "64k"}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=study, env=os.environ | kept)
-    assert done.returncode == 0, done.stderr
-    assert "first 2" in done.stdout
-    assert "No space left on device" in done.stderr
-    assert "Traceback" not in done.stderr
-    whole = {name: v for name, v in numbers(peace / "out").items() if name != "report.md"}
-    found = numbers(study / "done")
-    assert {name: found[name] for name in whole} == whole

@@ -14,7 +14,6 @@ from small_scenes import BALL, BARE, MATERIAL, MESH, OUTER, SPRINGS, TUBE, ball
 
 from jaxtrachea import (
     EffectOptions,
-    Material,
     PlanError,
     Poses,
     Presses,
@@ -150,32 +149,6 @@ def test_the_energy_by_the_place_is_that_of_the_work():
     by = jax.jit(functools.partial(gradient, **how))(TUBE, material, solved_press).s
     assert abs(float(true)) > 1e-3
     np.testing.assert_allclose(by, float(true), rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_derivatives_and_lanes():
-    """Forward = reverse = differences by material and displacement; `vmap` over e_1."""
-    path = down([1.0, 4.0], 73.3)
-    scene = make_scene(TUBE, SOFT, path, effects=BONDED)
-    names = ("EI_L", "k_M", "k_1", "k_3", "e_1", "e_2")
-    x = jnp.array([float(getattr(SOFT, n)) for n in names] + [1.0])
-
-    def values(x):
-        material = Material(**dict(zip(names, x[:-1], strict=True)))
-        out = simulate(scene, material, Presses(path.s, path.phi, path.displacement * x[-1]))
-        return jnp.concatenate([out.force[:, 1], out.joints[:, 6:9, 1].ravel()])
-
-    quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-    forward, reverse = quick(jax.jacfwd(values))(x), quick(jax.jacrev(values))(x)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
-    value = quick(values)
-    for i in range(len(x)):
-        h = 1e-5 * jnp.zeros_like(x).at[i].set(x[i])
-        difference = (value(x + h) - value(x - h)) / (2 * h[i])
-        np.testing.assert_allclose(forward[:, i], difference, rtol=1e-6, atol=1e-8)
-    lanes = quick(jax.vmap(lambda e: values(x.at[4].set(e))))(jnp.array([0.0, E_1, 0.15]))
-    np.testing.assert_allclose(lanes[1], value(x), rtol=1e-12)
-    assert lanes[0, 1] < lanes[1, 1] < lanes[2, 1] < 0  # pushed outwards: less the softer
 
 
 GIVEN = frozenset({"e_1", "e_2"})

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scenes import BALL, MATERIAL, SPRINGS, TUBE, ball
+from small_scenes import BALL, MATERIAL, TUBE, ball
 
 from jaxtrachea import EffectOptions, Poses, Presses, make_scene, simulate, with_geometry
 from jaxtrachea.scene.stage import Tool
@@ -113,38 +113,3 @@ def test_at_first_touch_on_a_ring_at_rest_and_before():
 
     directions = np.eye(21)[[0, 1, 5, 6, 9, 10, 13, 16, 20]]
     agree(f, jnp.zeros(21), jnp.asarray(directions), 2e-6)
-
-
-@pytest.mark.slow
-def test_refused_rows_leave_the_derivatives_of_the_others_alone():
-    """By the ring positions: of force, joints and vertices, as where nothing is refused."""
-    effects = {"contact_point": "per_step"}
-    s, D = np.array([75.0, 75.0, 170.0, 75.0, 75.0, np.nan]), np.zeros((6, 3))
-    D[:, 1] = [-2.0, np.nan, -2.0, -4e5, -4.0, -2.0]
-    path, good = Presses(s, np.zeros(6), D), np.array([0, 4])
-    only = Presses(s[good], np.zeros(2), D[good])
-    scene = make_scene(TUBE, SPRINGS, only, mesh=COARSE, effects=EffectOptions(**effects))
-
-    def f(shift, path, rows):
-        rings = TUBE.ring_positions + shift
-        there = with_geometry(scene, dataclasses.replace(TUBE, ring_positions=rings))
-        out = simulate(there, SPRINGS, path)
-        shown = out.force, out.skeleton, out.joints, out.vertices
-        return jnp.concatenate([v[rows].ravel() for v in shown]), (out.status, out.vertices)
-
-    def pulled(shift, path, rows):
-        v, pull, (status, vertices) = jax.vjp(lambda x: f(x, path, rows), shift, has_aux=True)
-        return v, pull(jnp.cos(jnp.arange(v.size, dtype=v.dtype)))[0], status, vertices
-
-    run, rest = jax.jit(pulled, compiler_options=FAST), jnp.zeros(TUBE.rings)
-    value, slope, status, vertices = run(rest, path, good)
-    assert all((np.asarray(status) == 0) == np.isin(np.arange(6), good))
-    gone = np.isnan(np.asarray(vertices)).all(axis=(1, 2))  # one too deep is there, with a status
-    assert gone.tolist() == [False, True, True, False, False, True]
-    wanted, slope_alone, *_ = run(rest, only, np.arange(2))
-    np.testing.assert_allclose(value, wanted, rtol=1e-12)
-    np.testing.assert_allclose(slope, slope_alone, rtol=1e-9, atol=1e-9 * abs(slope_alone).max())
-    way, h = jnp.sin(jnp.arange(TUBE.rings, dtype=float)), 1e-4
-    ahead, behind = (run(step * way, path, good)[0] for step in (h, -h))
-    weights = np.cos(np.arange(len(value)))
-    np.testing.assert_allclose(slope @ way, weights @ (ahead - behind) / (2 * h), rtol=1e-5)

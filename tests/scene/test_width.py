@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import beam_fem
-import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -274,26 +273,6 @@ def test_paths_beside_a_path_lie_on_the_tube():
         beside = np.ravel(samples(full).s)
         assert furthest(beside) == s_c
         assert np.ptp(beside) == pytest.approx(2.5)
-
-
-@pytest.mark.slow
-def test_a_sweep_by_command_lies_on_the_tube(tmp_path, monkeypatch, capsys):
-    """Its points are spread over where all of the tool does, and it says the width."""
-    monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text(
-        '[material]\nEI_L = "900 N mm^2"\nk_M = "0.2 N/mm"\nk_1 = "20 N/mm"\nk_3 = "0 N/mm^3"\n'
-        '[model]\nhalf_width = "2.36 mm"\n[path]\ns = "75 mm"\nsteps = 1\n'
-        'displacement = ["0 mm", "-0.1 mm", "0 mm"]\n[output]\nsurface = false\npictures = false\n'
-        '[sweep]\ndepth = "0.1 mm"\nphi_count = 1\n'
-    )
-    code, out, _ = run_cli(monkeypatch, capsys, "sweep", "scene.toml", "--out", "maps")
-    assert code == 0
-    assert "0 without a solution" in out
-    assert "sweep: width 'punch', half_width is 2.36 mm" in " ".join(out.split())
-    with h5py.File("maps/sweep.h5") as file:
-        s = np.unique(file["s"][:])
-    step = (160 - 2 * 2.36) / len(s)
-    np.testing.assert_allclose(s, 2.36 + step * (0.5 + np.arange(len(s))))
 
 
 @pytest.mark.slow

@@ -268,30 +268,6 @@ def test_an_equilibrium_that_is_no_minimum_is_seen():
 
 
 @pytest.mark.slow
-def test_few_and_many_rings():
-    """2 and 200 rings: the linear limit, and balance and work at large displacement."""
-    count = 200
-    length, rings = 10.0 * (count + 1), 10.0 * np.arange(1, count + 1)
-    geometry = Geometry.create(length, rings, radius=RADIUS)
-    s_c = length / 2 + 1.3
-    values = VALUES | {"footprint": 1.0}
-
-    @jax.jit
-    def at(path):
-        return press_sections(geometry, SectionMaterial(**values), s_c, 0.9, path)
-
-    p = values | {"R": RADIUS, "alpha": 2 * np.pi / 3}
-    p |= {"k_n": p["bed_n"], "k_t": p["bed_t"]}
-    small = inward(jax.tree.map(np.asarray, at(jnp.asarray(SMALL))), 0.9)[-1] / SMALL[-1]
-    wanted = linear_force(p, length, rings, s_c, 0.9)
-    np.testing.assert_allclose(small, wanted, atol=2e-5 * wanted[0])
-    got = jax.tree.map(np.asarray, at(jnp.asarray(PATH)))
-    assert np.all(got.status == PressStatus.OK)
-    work = 3 * (WEIGHTS @ inward(got, 0.9)[:-1, 0])
-    assert work == pytest.approx(got.energy[-1], rel=1e-8)
-
-
-@pytest.mark.slow
 def test_accepted_states_are_equilibria():
     """Three more of Newton's steps move no mode: walls soft and stiff, paths fine and coarse."""
     geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS)

@@ -66,22 +66,3 @@ def test_reverse_is_forward():
     back = jax.jit(lambda x, w: jax.vjp(force, x)[1](w)[0])  # of one result
     reverse = np.stack([back(FLAT, w)[USED] for w in jnp.eye(3)])
     np.testing.assert_allclose(reverse, forward(), atol=1e-9 * np.abs(forward()).max())
-
-
-@pytest.mark.slow
-def test_second_derivatives():
-    """By the displacement and EI_C: the rule of the first derivatives is differentiated itself."""
-    i = int(np.flatnonzero(np.asarray(FLAT) == 25.0)[0])  # EI_C of the third ring
-    last = FLAT.size - 1
-
-    def energy(x):
-        return force(FLAT.at[jnp.array([i, last])].set(x))[2]
-
-    x, h = FLAT[jnp.array([i, last])], 1e-4
-    # Slope and its change along a direction: one program for both.
-    slope = jax.jit(lambda x, v: jax.jvp(jax.grad(energy), (x,), (v,)))
-    unit = jnp.eye(2)
-    hessian = np.array([slope(x, v)[1] for v in unit])
-    by_hand = [(slope(x + h * v, v)[0] - slope(x - h * v, v)[0]) / (2 * h) for v in unit]
-    np.testing.assert_allclose(hessian, by_hand, atol=1e-6)
-    np.testing.assert_allclose(hessian, hessian.T, atol=1e-6)

@@ -227,7 +227,6 @@ def test_the_wall_meets_rings_and_contact_and_is_continuous():
 
 #: Press: rms of the error over D, for D = 1 and 6 mm; what is measured, and 0.002.
 SPECIMEN = {
-    "mid_s022": (0.062, 0.049),  # (.., 0.046) while the spans at the clamps softened: c_end = 1
     "off_s075_p90": (0.059, 0.067),
 }
 
