@@ -11,6 +11,10 @@ is 0 where the tool leaves the tube. The point of the tool that holds stays with
 contact: a tool that rolls or spins takes another one, pressed straight in. A step longer than the
 tube's radius, or along the surface than the dent is wide, is no path: the tool touches anew,
 straight in.
+
+A place that follows or gives way stores more or less than before, at the same press. No hand does
+this work, so it is told as dissipated: what of friction is left to the elastic wall (dE/ds, as in
+`configurational`), and what a press that gives way loses.
 """
 
 from typing import Any

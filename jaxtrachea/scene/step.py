@@ -46,7 +46,7 @@ from jaxtrachea.scene.step_together import States, move_tools
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.
-STATE_VERSION = 3
+STATE_VERSION = 4
 
 
 class Origin(NamedTuple):

