@@ -46,7 +46,7 @@ def mixed():
 
 
 def columns_of(result, lanes):
-    return omitted_zeros._columns(result, lanes, result.theta[lanes], result.study)
+    return omitted_zeros._columns(result, lanes, result.theta[lanes], result.study.take(lanes))
 
 
 def contains(result, lane, name):

@@ -88,8 +88,9 @@ def draw_residuals(shown: Shown):
             if lane in lined:
                 lines.append((x, r, shown.colour(curve.s_c)))
     values, depth = np.concatenate(pooled), np.concatenate(depths)
-    seen = np.isfinite(values)
-    values, depth = values[seen], depth[seen]
+    del pooled, depths  # as large as the data
+    if not (seen := np.isfinite(values)).all():
+        values, depth = values[seen], depth[seen]
     limit = _scale(values)
     for x, r, colour in lines:
         left.plot(x, r, lw=0.7, alpha=0.7, color=colour)
