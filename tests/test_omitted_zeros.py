@@ -132,6 +132,17 @@ def test_the_promise_is_the_fall_of_the_sum_of_squares(mixed):
     np.testing.assert_allclose(value[0], step[3], rtol=1e-5)
 
 
+def test_lanes_that_are_not_looked_at_one_by_one_would_ask_for_nothing(mixed):
+    _, plain, _ = mixed
+    lanes = np.arange(plain.lanes)
+    columns, able = columns_of(plain, lanes), np.ones((plain.lanes, 2, 1), bool)
+    chosen = [bool(omitted_zeros._chosen(plain, columns, n, able[n])) for n in lanes]
+    may = omitted_zeros._may_ask(plain, columns, able)
+    assert any(chosen)
+    assert not may.all()
+    assert may[chosen].all()
+
+
 def test_a_model_that_misses_the_curve_asks_for_nothing():
     """Forces of the 7th power and no air: correlated residuals are the model's, not a zero's."""
     rng = np.random.default_rng(5)

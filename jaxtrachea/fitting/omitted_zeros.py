@@ -39,6 +39,8 @@ ZEROS = ("onset", "force_offset")
 _STEP = 1e-5
 #: Part of a column that others leave below which it is a combination of them.
 _ALIKE = 1e-6
+#: What products of whole columns may be rounded by.
+_ROUNDING = 1e-3
 #: Gauss-Newton steps, the first one included, after which residuals must not be correlated.
 STEPS = 4
 #: Lanes looked at together: of many, what they are looked at by takes more memory than all curves.
@@ -97,11 +99,11 @@ def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
 def _ask(result: FitResult, lanes: Int[np.ndarray, " n"], able, out: Asked) -> None:
     """Add what some lanes ask for."""
     columns = _columns(result, lanes, result.theta[lanes], result.study.take(lanes))
-    chosen = [_chosen(result, columns, n, able[lane]) for n, lane in enumerate(lanes)]
-    rows = np.flatnonzero([len(v) > 0 for v in chosen])
-    if not len(rows):
+    may = np.flatnonzero(_may_ask(result, columns, able[lanes]))
+    found = {n: v for n in may.tolist() if (v := _chosen(result, columns, n, able[lanes[n]]))}
+    if not found:
         return
-    chosen, columns = [chosen[n] for n in rows], _Columns(*(v[rows] for v in columns))
+    chosen, columns = list(found.values()), _Columns(*(v[list(found)] for v in columns))
     for lane, names, fits in zip(
         columns.lanes, chosen, _fitting(result, columns, chosen), strict=True
     ):
@@ -228,6 +230,32 @@ def _weights(result: FitResult, lanes: Int[np.ndarray, " n"], value) -> np.ndarr
     size = jnp.asarray((value * scale[:, None]) ** 2)
     _, slope = robust(study.model.loss, size, study.model.loss_scale)
     return weight * np.sqrt(np.asarray(slope))
+
+
+def _may_ask(result: FitResult, columns: _Columns, able) -> Bool[np.ndarray, " n"]:
+    """Lanes of which one zero alone promises enough, were the residuals that it leaves independent.
+
+    All at once: of most lanes that says no, as `_chosen` would.
+    """
+    r, J, C = columns.residual, columns.unknowns, columns.zeros
+    inner = np.linalg.pinv(
+        np.einsum("nptm,nqtm->npq", J, J, optimize=True), rcond=1e-14, hermitian=True
+    )
+    of_zeros = np.einsum("nztm,nptm->nztp", C, J, optimize=True) @ inner[:, None]
+    slope = np.einsum("nztm,ntm->nzt", C, r)
+    slope -= np.einsum("nztp,np->nzt", of_zeros, np.einsum("nptm,ntm->np", J, r))
+    size = np.einsum("nztm,nztm->nzt", C, C)
+    own = size - np.einsum("nztp,nptm,nztm->nzt", of_zeros, J, C, optimize=True)
+    fall = slope**2 / np.where(own > 0.5 * _ALIKE * size, own, np.inf)
+    lanes = columns.lanes.tolist()
+    left = np.array([_left(result, lane, 1) for lane in lanes])
+    asked = np.array([_asked(result, lane, 1) for lane in lanes])
+    square = np.einsum("ntm,ntm->n", r, r)
+    unit = (square[:, None, None] - fall) / np.maximum(left, 1)[:, None, None]
+    known = result.study.noise_known[lanes][:, None, None]
+    unit = np.where(known, np.maximum(unit, 1), unit)
+    enough = fall > (1 - _ROUNDING) * asked[:, None, None] * unit
+    return np.any(able & enough, axis=(1, 2))
 
 
 def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
