@@ -13,7 +13,7 @@ import jaxtrachea
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 #: Rooms from the bottom up; `fit` and `scene` are neighbours, neither knows the other.
 ORDER = [
-    {"_errors", "_linear", "_compiler", "_threads"},
+    {"_errors", "_linear", "_compiler", "_threads", "_memory"},
     {"units", "status", "_numerics", "_arguments", "_packed"},
     {"_written_out"},
     {"fusion"},

@@ -46,7 +46,7 @@ def mixed():
 
 
 def columns_of(result, lanes):
-    return omitted_zeros._columns(result, lanes, result.theta[lanes], result.study)
+    return omitted_zeros._columns(result, lanes, result.theta[lanes], result.study.take(lanes))
 
 
 def contains(result, lane, name):
@@ -130,6 +130,17 @@ def test_the_promise_is_the_fall_of_the_sum_of_squares(mixed):
     step, within, *_ = np.linalg.lstsq(A, -r)
     np.testing.assert_allclose(fall[0], without[0] - within[0], rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(value[0], step[3], rtol=1e-5)
+
+
+def test_lanes_that_are_not_looked_at_one_by_one_would_ask_for_nothing(mixed):
+    _, plain, _ = mixed
+    lanes = np.arange(plain.lanes)
+    columns, able = columns_of(plain, lanes), np.ones((plain.lanes, 2, 1), bool)
+    chosen = [bool(omitted_zeros._chosen(plain, columns, n, able[n])) for n in lanes]
+    may = omitted_zeros._may_ask(plain, columns, able)
+    assert any(chosen)
+    assert not may.all()
+    assert may[chosen].all()
 
 
 def test_a_model_that_misses_the_curve_asks_for_nothing():

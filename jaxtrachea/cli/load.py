@@ -7,6 +7,9 @@ from rich.markup import escape
 
 from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
 
+#: Arrays that a curve and its lane have in common.
+SAMPLES = ("displacement", "force")
+
 
 def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[str] | None = None):
     """Specification, measurements and study; what is wrong with curves goes to stderr.
@@ -40,6 +43,7 @@ def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[st
         study = study_of(spec, measurements, refits=refits)
         _note_unused_batch(spec, study, printed)
         measurements = _with_zeros(measurements, study, printed)
+        measurements, study = _samples_once(measurements, study)
         return spec, _with_depths(measurements, study, printed), study
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
@@ -55,6 +59,21 @@ def _note_unused_batch(spec, study, printed: set[str]) -> None:
         if study.one_at_a_time:
             why = "sections take one lane at a time on a CPU"
         _print("note", [f"fit.batch = {batch} is not used: {why}"], printed)
+
+
+def _samples_once(measurements, study):
+    """Both with curves whose displacements and forces are those of the lanes, not copies."""
+    from jaxtrachea.fitting.study import with_recipe
+
+    def shared(curve, k: int, t: int):
+        arrays = {n: getattr(study.lanes, n)[k, t, : len(curve.force)] for n in SAMPLES}
+        return dataclasses.replace(curve, **arrays)
+
+    lanes = [[shared(c, k, t) for t, c in enumerate(lane)] for k, lane in enumerate(study.curves)]
+    own = {(c.specimen, c.trial): c for lane in lanes for c in lane}
+    curves = tuple(own[c.specimen, c.trial] for c in measurements.curves)
+    study = with_recipe(study, curves=tuple(map(tuple, lanes)))
+    return dataclasses.replace(measurements, curves=curves), study
 
 
 def _with_zeros(measurements, study, printed: set[str]):

@@ -1,6 +1,7 @@
 """One run of a fit: everything that was asked for, computed, written and shown."""
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -57,28 +58,21 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.files.pictures import with_ending, without_lost
     from jaxtrachea.files.provenance import provenance
     from jaxtrachea.files.table import Table
-    from jaxtrachea.fitting.zero_messages import cells
-    from jaxtrachea.measurements.usage_tables import usage_rows, usage_section
+    from jaxtrachea.measurements.usage_tables import usage_section
     from jaxtrachea.report.fit import report_text
     from jaxtrachea.report.plots import draw_all
     from jaxtrachea.report.understood import understood
     from jaxtrachea.results.hdf5 import write_hdf5
     from jaxtrachea.results.rows import parameter_rows, summary_rows
     from jaxtrachea.trials.differences import differing_trials
-    from jaxtrachea.trials.repeats import trial_remarks, trial_sentences
+    from jaxtrachea.trials.repeats import trial_sentences
 
     ending = loaded.output.format
     with beside(draw_all, folder, findings, ending) as drawing:
         Table(summary_rows(findings, measurements.bad)).write_csv(folder / "summary.csv")
         Table(parameter_rows(findings)).write_csv(folder / "parameters.csv")
         apart = differing_trials(measurements.curves)
-        zeros, of_trials = cells(findings.result.study), trial_remarks(apart)
-        rows = []
-        for row in usage_rows(measurements.curves):
-            curve = str(row["specimen"]), str(row["trial"])
-            remarks = "; ".join(filter(None, (str(row["remarks"]), of_trials.get(curve))))
-            rows.append(row | {"remarks": remarks} | zeros.get(curve, {}))
-        Table(rows).write_csv(folder / "curves.csv")
+        Table(_curve_rows(measurements, findings, apart)).write_csv(folder / "curves.csv")
         write_tables(folder, findings)
         title = loaded.title or spec.stem
         curves = measurements.curves
@@ -108,6 +102,19 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
         command = shlex.join(["jaxtrachea", "fit", str(spec)])
         section = explorer(influence, command, loaded.data.exclude)
     write_text(folder / "report.html", page(text, pictures, made, files=names, explorer=section))
+
+
+def _curve_rows(measurements, findings, apart) -> Iterator[dict[str, object]]:
+    """Of each curve what is used, what is doubtful, and the zeros that it takes."""
+    from jaxtrachea.fitting.zero_messages import cells
+    from jaxtrachea.measurements.usage_tables import usage_rows
+    from jaxtrachea.trials.repeats import trial_remarks
+
+    zeros, of_trials = cells(findings.result.study), trial_remarks(apart)
+    for row in usage_rows(measurements.curves):
+        curve = str(row["specimen"]), str(row["trial"])
+        remarks = "; ".join(filter(None, (str(row["remarks"]), of_trials.get(curve))))
+        yield row | {"remarks": remarks} | zeros.get(curve, {})
 
 
 def write_tables(folder: Path, findings) -> None:

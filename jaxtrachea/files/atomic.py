@@ -1,15 +1,16 @@
 """Files that are written whole or not at all, also on a disk that fills up meanwhile.
 
-HDF5 files are put together in memory: the HDF5 library that meets a full disk leaves its file open,
-prints a traceback for every object in it and ends the process with a segmentation fault.
+The HDF5 library is not told of a full disk: it would leave its file open, print a traceback for
+every object in it and end the process with a segmentation fault.
 """
 
 import contextlib
 import errno
 import io
 import os
+import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +38,18 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         OSError: nothing was written; a file of that name is as it was.
     """
+    with _put_into_place(path) as beside, beside.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+@contextlib.contextmanager
+def _put_into_place(path: Path) -> Iterator[Path]:
+    """A file beside another that takes its place when the block ends, and is gone if it raises."""
     beside = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}")
     try:
-        with beside.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
+        yield beside
         beside.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):
@@ -50,9 +57,54 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
+class _Image:
+    """A file as the HDF5 library writes it; the first error is kept, and nothing written after it.
+
+    Attributes:
+        error: of the disk; None so far.
+    """
+
+    def __init__(self, stream: io.FileIO):
+        """A stream without buffer, open for reading and writing."""
+        self.error: OSError | None = None
+        self._stream = stream
+        self.seek, self.tell = stream.seek, stream.tell
+
+    def write(self, data: Any) -> int:
+        """All of it, or nothing where the disk has none left."""
+        left = memoryview(data).cast("B")
+        while len(left) and self.error is None:
+            left = left[self._do(self._stream.write, left) or 0 :]
+        return memoryview(data).nbytes
+
+    def readinto(self, buffer: Any) -> int:
+        """Zeros where nothing could be written."""
+        view = memoryview(buffer).cast("B")
+        count = self._do(self._stream.readinto, view) or 0
+        view[count:] = bytes(len(view) - count)
+        return len(view)
+
+    read = readinto  # by its name h5py tells a file from a path
+
+    def truncate(self, size: int) -> int:
+        """The file gets this size."""
+        self._do(self._stream.truncate, size)
+        return size
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+    def _do(self, function: Callable[[Any], int | None], value: Any) -> int | None:
+        try:
+            return function(value)
+        except OSError as error:
+            self.error = self.error or error
+            return None
+
+
 @contextlib.contextmanager
 def hdf5_file(path: Path, mode: str = "x") -> Iterator[Any]:
-    """An HDF5 file in memory that is written when the block ends; nothing if it raises.
+    """An HDF5 file that is in its place when the block ends; nothing is if it raises.
 
     Args:
         path: of the file.
@@ -69,10 +121,16 @@ def hdf5_file(path: Path, mode: str = "x") -> Iterator[Any]:
 
     if mode == "x" and path.exists():
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-    image = io.BytesIO(b"" if mode == "x" else path.read_bytes())
-    with h5py.File(image, "w" if mode == "x" else mode) as file:
-        yield file
-    write_whole(path, image.getvalue())
+    with _put_into_place(path) as beside:
+        if mode != "x":
+            shutil.copyfile(path, beside)
+        with beside.open("w+b" if mode == "x" else "r+b", buffering=0) as stream:
+            image = _Image(stream)
+            with h5py.File(image, "w" if mode == "x" else mode) as file:
+                yield file
+            if image.error is not None:
+                raise image.error
+            os.fsync(stream.fileno())
 
 
 def write_text(path: Path, text: str) -> None:

@@ -31,6 +31,7 @@ from jax.core import Tracer
 
 import jaxtrachea
 from jaxtrachea._compiler import quick_options
+from jaxtrachea._memory import give_back
 from jaxtrachea.files import kept_trace
 from jaxtrachea.files.kept_trace import KeptTrace
 from jaxtrachea.files.programs import TRACED
@@ -140,6 +141,7 @@ class Traced:
                 with contextlib.suppress(Exception):  # what is wrong is said by the plain call
                     compiled = self._by_trace(folder, given, kinds, device)
                 self._compiled[key] = compiled or self._plain
+                give_back()
             return self._compiled[key]
 
     def lower(self, *arguments: Any, **named: Any) -> Any:

@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from jaxtrachea.fitting.relaxing import by_records, span_of, with_span
 from jaxtrachea.fitting.study import Recipe, Study, first_touch_of
 from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
+from jaxtrachea.measurements.record_zeros import Zeros
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.trachea.geometry import Geometry
@@ -114,23 +115,25 @@ def with_zeros(study: Study, asked: Taken) -> Study:
     assert recipe is not None
     every = {k: {*recipe.asked.get(k, ()), *asked.get(k, ())} for k in {*recipe.asked, *asked}}
     curves = [c for lane in study.curves for c in lane]
-    again = _built(curves, dataclasses.replace(recipe, asked=every))
-    return with_recipe(again, study.holdout_groups)
+    again = _built(curves, dataclasses.replace(recipe, asked=every), study)
+    return with_recipe(again, holdout_groups=study.holdout_groups)
 
 
-def with_recipe(study: Study, holdout_groups: tuple[tuple[str, ...], ...]) -> Study:
-    """The study with groups of trials that are left out together, its recipe kept."""
-    out = dataclasses.replace(study, holdout_groups=holdout_groups)
+def with_recipe(study: Study, **changes: Any) -> Study:
+    """The study with changes that its lanes do not depend on, and its recipe."""
+    out = dataclasses.replace(study, **changes)
     object.__setattr__(out, "recipe", study.recipe)
     return out
 
 
-def _built(curves: Sequence[Curve], recipe: Recipe) -> Study:
-    """The study of curves that the model can press."""
+def _built(curves: Sequence[Curve], recipe: Recipe, before: Study | None = None) -> Study:
+    """The study of curves that the model can press; `before`: with fewer zeros."""
     geometry, options, noise, weighting = (
         recipe.geometry, recipe.options, recipe.noise, recipe.weighting,
     )  # fmt: skip
-    own = resolved(recipe.parameters, curves, options, noise.force, recipe.asked)
+    own = resolved(
+        recipe.parameters, curves, options, noise.force, recipe.asked, recipe.zeros
+    )  # fmt: skip
     parameters = natural_steps(own.parameters, curves, own.recorded, own.taken)
     if level_of(options).relaxes:
         span = span_of(curves)
@@ -145,6 +148,8 @@ def _built(curves: Sequence[Curve], recipe: Recipe) -> Study:
         noise=noise, weighting=weighting, tool_radius=recipe.tool_radius,
         level=level_of(options),
     )  # fmt: skip
+    if before is not None:  # of the same curves, in memory once
+        lanes = lanes._replace(displacement=before.lanes.displacement, force=before.lanes.force)
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
         lanes = lanes._replace(balance=weights)
@@ -172,8 +177,20 @@ def _built(curves: Sequence[Curve], recipe: Recipe) -> Study:
         record_zeros=found,
         force_share=_force_share(noise, known, lanes, parameters, change_points, model),
     )
-    object.__setattr__(study, "recipe", recipe)
+    known = dataclasses.replace(recipe, zeros=_by_lanes(own.zeros, curves, groups))
+    object.__setattr__(study, "recipe", known)
     return study
+
+
+def _by_lanes(
+    zeros: Zeros | None, curves: Sequence[Curve], groups: Sequence[Sequence[Curve]]
+) -> Zeros | None:
+    """What the records of curves show, lane after lane."""
+    if zeros is None:
+        return None
+    row = {(c.specimen, c.trial): k for k, c in enumerate(curves)}
+    order = [row[c.specimen, c.trial] for lane in groups for c in lane]
+    return Zeros(*(v[order] for v in zeros))
 
 
 def _force_share(
@@ -190,12 +207,12 @@ def _force_share(
     """
     if noise.force_share is not None:
         return noise.force_share or None
-    if model.options.coupling == "total":
+    if known or model.options.coupling == "total":
         return None
     touch = first_touch_of(lanes, parameters, change_points)[..., None]
     depth = depths(np.asarray(lanes.displacement), touch, model.options)
-    deepest = np.max(np.where(lanes.precision > 0, np.abs(depth), 0))
-    return None if known or deepest <= DEEP * float(model.geometry.radius) else "estimate"
+    deepest = np.max(np.abs(depth), where=np.asarray(lanes.precision) > 0, initial=0)
+    return None if deepest <= DEEP * float(model.geometry.radius) else "estimate"
 
 
 def _admitted(
@@ -249,9 +266,11 @@ def _from_touch(
             before = found[..., 0] <= first
             seen = np.where(before, found[..., 0], seen)
             found[..., 0] = np.where(np.isnan(found[..., 0]), np.nan, seen)
-    touch = first_touch_of(lanes, parameters, seen)
-    depth = depths(np.asarray(lanes.displacement), touch[..., None], options)
-    return weighed_by_depth(lanes, noise, depth), seen
+    if noise.joints_share:
+        touch = first_touch_of(lanes, parameters, seen)
+        depth = depths(np.asarray(lanes.displacement), touch[..., None], options)
+        lanes = weighed_by_depth(lanes, noise, depth)
+    return lanes, seen
 
 
 def _warn_of(bad: Sequence[BadCurve]) -> None:

@@ -31,6 +31,8 @@ from jaxtrachea.fitting.predictions import Prediction
 CORRELATED = 0.3
 #: Pairs of neighbours from which a correlation is taken.
 MIN_PAIRS = 10
+#: Lanes looked at together.
+TOGETHER = 256
 #: Times 1 / sqrt(pairs): correlation that independent noise exceeds in 5 % of all records.
 CHANCE = 1.645
 #: Independent samples that must be left over the unknowns for an interval.
@@ -67,6 +69,11 @@ def lag_correlation(residual: Float[np.ndarray, "lanes trials samples"]) -> np.n
     About 0 for independent noise, near 1 where the model misses the shape of the curves; NaN with
     fewer than `MIN_PAIRS` pairs. Not centred: a residual of one sign is correlated, too.
     """
+    blocks = range(0, max(len(residual), 1), TOGETHER)
+    return np.concatenate([_lag_correlation(residual[k : k + TOGETHER]) for k in blocks])
+
+
+def _lag_correlation(residual: Float[np.ndarray, "lanes trials samples"]) -> np.ndarray:
     r = np.nan_to_num(residual)
     pair = np.isfinite(residual[..., 1:]) & np.isfinite(residual[..., :-1])
     both = np.sum(r[..., 1:] * r[..., :-1] * pair, axis=(1, 2))

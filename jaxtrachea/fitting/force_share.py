@@ -6,7 +6,7 @@ of a fit by maximum likelihood, in turns with the fit. F is the force that the f
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -75,7 +75,7 @@ def with_found_shares(
     """The study with the shares of its fit: of lanes `rows` those of `new`, else those of `before`.
 
     Args:
-        study: as it was built.
+        study: as it was built, without shares.
         before: of all its lanes, as a fit left it.
         rows: lanes of `new`.
         new: of these lanes, as a fit left it.
@@ -85,13 +85,14 @@ def with_found_shares(
         wanted = study.force_share is not None
         return dataclasses.replace(study, force_share=None) if wanted else study
     old, other = as_weighed(before), as_weighed(new)
-
-    def both(name: str) -> Any:
-        values, of_rows = getattr(old.shares, name), getattr(other.shares, name)
-        return None if values is None else _replaced(values, rows, of_rows)
-
+    assert old.shares is not None
+    assert other.shares is not None
+    sigma = old.shares.sigma
+    if sigma is not None:
+        sigma = _replaced(sigma, rows, other.shares.sigma)
+    share = _replaced(old.shares.share, rows, other.shares.share)
     precision = _replaced(old.lanes.precision, rows, other.lanes.precision)
-    return with_shares(study, Shares(*map(both, Shares._fields)), precision)
+    return with_shares(study, Shares(share, sigma, np.asarray(study.lanes.precision)), precision)
 
 
 def _replaced(values, rows: Int[np.ndarray, " n"], by) -> np.ndarray:

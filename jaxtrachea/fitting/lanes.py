@@ -8,7 +8,6 @@ import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -182,6 +181,7 @@ class _Layout:
         vectors: whether the model shows more than normal forces and motions on the midline.
         time: whether it relaxes.
         curves: all of them.
+        lanes: how many.
     """
 
     parameters: Sequence[Parameter]
@@ -196,6 +196,7 @@ class _Layout:
     vectors: bool
     time: bool
     curves: Sequence[Curve]
+    lanes: int
 
 
 def mean_lengths(groups: Sequence[Sequence[Curve]], *, joint: bool) -> Float[np.ndarray, " lanes"]:
@@ -218,8 +219,6 @@ def curve_weights(
 
 def weighed_by_depth(lanes: Lane, noise: Noise, depth: Float[np.ndarray, "lanes T N"]) -> Lane:
     """The lanes with markers weighed by depths from first touch, mm, not by the records' zeros."""
-    if noise.joints_share == 0:
-        return lanes
     recorded = noise.joints_precision(np.asarray(lanes.displacement))
     ratio = noise.joints_precision(depth) / recorded
     changed = {}
@@ -268,35 +267,48 @@ def lanes_of(
         vectors=vectors,
         time=level.relaxes,
         curves=every,
+        lanes=len(groups),
     )
-    lanes = [_lane(layout, *lane) for lane in zip(groups, unknowns, strict=True)]
-    return jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+    whole = _blank(layout)
+    for k, (curves, names) in enumerate(zip(groups, unknowns, strict=True)):
+        _fill({n: v if v is None else v[k] for n, v in whole.items()}, layout, curves, names)
+    first = whole["precision"].flat[0]
+    if (whole["precision"] == first).all():  # one number for all takes no room
+        whole["precision"] = np.broadcast_to(first, whole["precision"].shape)
+    return Lane(**whole)
 
 
-def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown]) -> Lane:
-    """One lane as padded float64 arrays."""
-    parameters, geometry, noise = layout.parameters, layout.geometry, layout.noise
-    T, N, J, P = layout.trials, layout.samples, len(parameters), layout.unknowns
-    joints = np.zeros((T, N, geometry.rings)) if layout.joints else None
-    lane: dict[str, Any] = {
-        "s_c": np.full(T, float(geometry.length) / 2),
-        "displacement": np.zeros((T, N)),
-        "force": np.zeros((T, N)),
-        "precision": np.zeros((T, N)),
-        "joints": joints,
-        "joint_precision": None if joints is None else joints.copy(),
-        "balance": np.ones(T),
+def _blank(layout: _Layout) -> dict[str, Any]:
+    """Padded float64 arrays of all lanes, without their curves."""
+    L, T, N, P = layout.lanes, layout.trials, layout.samples, layout.unknowns
+    parameters, rings = layout.parameters, layout.geometry.rings
+    out: dict[str, Any] = {
+        "s_c": np.full((L, T), float(layout.geometry.length) / 2),
+        "displacement": np.zeros((L, T, N)),
+        "force": np.zeros((L, T, N)),
+        "precision": np.zeros((L, T, N)),
+        "joints": np.zeros((L, T, N, rings)) if layout.joints else None,
+        "joint_precision": np.zeros((L, T, N, rings)) if layout.joints else None,
+        "balance": np.ones((L, T)),
         "blend": None,
-        "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
-        "index": np.full((T, J), -1, np.int32),
-        "lower": np.zeros(P),
-        "upper": np.zeros(P),
-        "active": np.zeros(P),
+        "value": np.tile(np.array([p.value for p in parameters], np.float64), (L, T, 1)),
+        "index": np.full((L, T, len(parameters)), -1, np.int32),
+        "lower": np.zeros((L, P)),
+        "upper": np.zeros((L, P)),
+        "active": np.zeros((L, P)),
     }
     if layout.vectors:
-        lane |= _blank_vectors(layout)
+        out |= _blank_vectors(layout)
     if layout.time:
-        lane |= {"time": np.zeros((T, N)), "rising": np.zeros((T, N))}
+        out |= {"time": np.zeros((L, T, N)), "rising": np.zeros((L, T, N))}
+    return out
+
+
+def _fill(
+    lane: dict[str, Any], layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown]
+) -> None:
+    """Put the curves and unknowns of one lane into its arrays."""
+    parameters, geometry, noise = layout.parameters, layout.geometry, layout.noise
     place = {key: i for i, key in enumerate(unknowns)}
     for i, (p, _, _) in enumerate(unknowns):
         lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
@@ -322,7 +334,6 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
             lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
         if layout.vectors:
             _add_vectors(lane, layout, t, curve)
-    return Lane(**lane)
 
 
 def has_ends(curve: Curve) -> bool:
@@ -339,13 +350,14 @@ def _has_motion(curve: Curve, *, vectors: bool) -> bool:
 
 def _blank_vectors(layout: _Layout) -> dict[str, Any]:
     """Arrays of what is off the midline or not along the normal; None where no curve has it."""
-    T, N, rings, curves = layout.trials, layout.samples, layout.geometry.rings, layout.curves
+    samples = layout.lanes, layout.trials, layout.samples
+    rings, curves = layout.geometry.rings, layout.curves
     shapes = {
-        "side_force": (any(c.side_force is not None for c in curves), (T, N)),
+        "side_force": (any(c.side_force is not None for c in curves), samples),
         "joint_side": (
-            any(c.joint_side_displacement is not None for c in curves), (T, N, rings),
+            any(c.joint_side_displacement is not None for c in curves), (*samples, rings),
         ),
-        "ends": (any(map(has_ends, curves)), (T, N, rings, 2, 2)),
+        "ends": (any(map(has_ends, curves)), (*samples, rings, 2, 2)),
     }  # fmt: skip
     precision_of = dict(FORCES + MARKERS)
     out: dict[str, Any] = {}
@@ -354,7 +366,8 @@ def _blank_vectors(layout: _Layout) -> dict[str, Any]:
         out[precision_of[name]] = np.zeros(shape) if there else None
     out |= {"phi_c": None, "direction": None}
     if any(off_midline(c) for c in curves):
-        out |= {"phi_c": np.zeros(T), "direction": np.tile([1.0, 0.0], (T, 1))}
+        L, T, _ = samples
+        out |= {"phi_c": np.zeros((L, T)), "direction": np.tile([1.0, 0.0], (L, T, 1))}
     return out
 
 

@@ -39,8 +39,12 @@ ZEROS = ("onset", "force_offset")
 _STEP = 1e-5
 #: Part of a column that others leave below which it is a combination of them.
 _ALIKE = 1e-6
+#: What products of whole columns may be rounded by.
+_ROUNDING = 1e-3
 #: Gauss-Newton steps, the first one included, after which residuals must not be correlated.
 STEPS = 4
+#: Lanes looked at together: of many, what they are looked at by takes more memory than all curves.
+TOGETHER = 256
 #: Number in `ZEROS` and trial, with the value that is promised, mm or N.
 Chosen = dict[tuple[int, int], float]
 
@@ -61,7 +65,7 @@ class _Columns(NamedTuple):
     """Whitened residuals of lanes that may ask, and their derivatives.
 
     Attributes:
-        lanes: of the study.
+        lanes: of the result.
         residual: (n, T, m).
         unknowns: derivative by each unknown, 0 where it is not free; (n, P, T, m).
         zeros: by each of `ZEROS` of each trial, mm and N; (n, Z, T, m).
@@ -87,14 +91,19 @@ def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
     able = _able(result)
     lanes = among[able[among].any(axis=(1, 2))]
     out = Asked({}, {})
-    if not len(lanes) or result.study.size == 0:
-        return out
-    columns = _columns(result, lanes, result.theta[lanes], result.study)
-    chosen = [_chosen(result, columns, n, able[lane]) for n, lane in enumerate(lanes)]
-    rows = np.flatnonzero([len(v) > 0 for v in chosen])
-    if not len(rows):
-        return out
-    chosen, columns = [chosen[n] for n in rows], _Columns(*(v[rows] for v in columns))
+    for first in range(0, len(lanes) if result.study.size else 0, TOGETHER):
+        _ask(result, lanes[first : first + TOGETHER], able, out)
+    return out
+
+
+def _ask(result: FitResult, lanes: Int[np.ndarray, " n"], able, out: Asked) -> None:
+    """Add what some lanes ask for."""
+    columns = _columns(result, lanes, result.theta[lanes], result.study.take(lanes))
+    may = np.flatnonzero(_may_ask(result, columns, able[lanes]))
+    found = {n: v for n in may.tolist() if (v := _chosen(result, columns, n, able[lanes[n]]))}
+    if not found:
+        return
+    chosen, columns = list(found.values()), _Columns(*(v[list(found)] for v in columns))
     for lane, names, fits in zip(
         columns.lanes, chosen, _fitting(result, columns, chosen), strict=True
     ):
@@ -102,7 +111,6 @@ def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
             curve = result.study.curves[lane][trial]
             out.names.setdefault((curve.specimen, curve.trial), set()).add(ZEROS[z])
             out.value[curve.specimen, curve.trial, ZEROS[z]] = value
-    return out
 
 
 def _fitting(result: FitResult, columns: _Columns, chosen: list[Chosen]) -> list[bool]:
@@ -111,8 +119,8 @@ def _fitting(result: FitResult, columns: _Columns, chosen: list[Chosen]) -> list
     By the linear model; where it says no, by a few Gauss-Newton steps, since air of a tenth of the
     press is far from none. A model that misses the curve anyway leaves them correlated.
     """
-    study, lanes = result.study, columns.lanes
-    theta = result.theta[lanes].copy()
+    lanes = columns.lanes
+    study, theta = result.study.take(lanes), result.theta[lanes].copy()
     shift = np.zeros((len(ZEROS), *study.lanes.s_c.shape))
     good = np.zeros(len(lanes), bool)
     for turn in range(STEPS):
@@ -135,8 +143,8 @@ def _fitting(result: FitResult, columns: _Columns, chosen: list[Chosen]) -> list
             good[n] = correlation <= CORRELATED
             theta[n] += step[: len(J)]
             for (z, t), v in zip(places, step[len(J) :], strict=True):
-                shift[z, lanes[n], t] += v
-        theta = np.clip(theta, study.lanes.lower[lanes], study.lanes.upper[lanes])
+                shift[z, n, t] += v
+        theta = np.clip(theta, study.lanes.lower, study.lanes.upper)
         if good.all():
             break
     return good.tolist()
@@ -172,17 +180,17 @@ def _columns(result: FitResult, lanes: Int[np.ndarray, " n"], theta, study: Stud
 
     Args:
         result: whose noise and free unknowns.
-        lanes: which.
+        lanes: which; n.
         theta: where; (n, P).
-        study: its study, or one with shifted records.
+        study: of these lanes, as they are or with shifted records.
     """
     relative = result.relative[lanes]
-    free = (study.lanes.active[lanes] > 0) & ~result.at_bound[lanes]
+    free = (study.lanes.active > 0) & ~result.at_bound[lanes]
     batch = study.batch_size(result.lanes, 256)  # as `predictions` has it: its program
 
     def values(study: Study, theta) -> np.ndarray:
         return map_lanes(
-            residual_value, study, theta, rows=lanes, batch=batch,
+            residual_value, study, theta, batch=batch,
             unoptimised=study.unoptimised(result.lanes),
         )  # fmt: skip
 
@@ -203,10 +211,10 @@ def _columns(result: FitResult, lanes: Int[np.ndarray, " n"], theta, study: Stud
     step = _STEP * np.where(study.lanes.precision > 0, np.abs(D), 0).max(axis=2)
     step = np.where(step > 0, step, 1.0)
     later = study.lanes._replace(displacement=D - step[..., None])
-    by_onset = slope(dataclasses.replace(study, lanes=later), theta, step[lanes])
+    by_onset = slope(dataclasses.replace(study, lanes=later), theta, step)
     by_offset = np.zeros_like(base)
     N = D.shape[2]
-    by_offset[..., :N] = study.lanes.precision[lanes] * weight[..., :N]
+    by_offset[..., :N] = study.lanes.precision * weight[..., :N]
     zeros = np.stack([by_onset, by_offset], axis=1)
     return _Columns(lanes, base * weight, unknowns, zeros)
 
@@ -222,6 +230,32 @@ def _weights(result: FitResult, lanes: Int[np.ndarray, " n"], value) -> np.ndarr
     size = jnp.asarray((value * scale[:, None]) ** 2)
     _, slope = robust(study.model.loss, size, study.model.loss_scale)
     return weight * np.sqrt(np.asarray(slope))
+
+
+def _may_ask(result: FitResult, columns: _Columns, able) -> Bool[np.ndarray, " n"]:
+    """Lanes of which one zero alone promises enough, were the residuals that it leaves independent.
+
+    All at once: of most lanes that says no, as `_chosen` would.
+    """
+    r, J, C = columns.residual, columns.unknowns, columns.zeros
+    inner = np.linalg.pinv(
+        np.einsum("nptm,nqtm->npq", J, J, optimize=True), rcond=1e-14, hermitian=True
+    )
+    of_zeros = np.einsum("nztm,nptm->nztp", C, J, optimize=True) @ inner[:, None]
+    slope = np.einsum("nztm,ntm->nzt", C, r)
+    slope -= np.einsum("nztp,np->nzt", of_zeros, np.einsum("nptm,ntm->np", J, r))
+    size = np.einsum("nztm,nztm->nzt", C, C)
+    own = size - np.einsum("nztp,nptm,nztm->nzt", of_zeros, J, C, optimize=True)
+    fall = slope**2 / np.where(own > 0.5 * _ALIKE * size, own, np.inf)
+    lanes = columns.lanes.tolist()
+    left = np.array([_left(result, lane, 1) for lane in lanes])
+    asked = np.array([_asked(result, lane, 1) for lane in lanes])
+    square = np.einsum("ntm,ntm->n", r, r)
+    unit = (square[:, None, None] - fall) / np.maximum(left, 1)[:, None, None]
+    known = result.study.noise_known[lanes][:, None, None]
+    unit = np.where(known, np.maximum(unit, 1), unit)
+    enough = fall > (1 - _ROUNDING) * asked[:, None, None] * unit
+    return np.any(able & enough, axis=(1, 2))
 
 
 def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:

@@ -23,6 +23,7 @@ from jaxtrachea.fitting.model import FitModel, columns_of
 from jaxtrachea.fitting.onset import first_touches
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.record_zeros import Zeros
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.optimisation import batching
 from jaxtrachea.trachea.geometry import Geometry
@@ -55,6 +56,7 @@ class Recipe:
         tool_radius: likewise.
         joint: likewise.
         asked: onsets and offsets that curves take on top of what their records show.
+        zeros: what the records show, in the order of the lanes' curves; None: not looked at.
     """
 
     geometry: Geometry
@@ -65,6 +67,7 @@ class Recipe:
     tool_radius: float | None
     joint: bool
     asked: Taken
+    zeros: Zeros | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -43,6 +43,7 @@ def resolved(
     options: Options,
     sigma: float | None = None,
     asked: Taken | None = None,
+    zeros: Zeros | None = None,
 ) -> Resolved:
     """The table with its `auto` rows decided.
 
@@ -52,6 +53,7 @@ def resolved(
         options: of the model.
         sigma: given standard deviation of a force sample, N; a curve's own comes before it.
         asked: what curves take on top of what their records show (`omitted_zeros`).
+        zeros: what the records show, as found before; None: they are looked at.
 
     Raises:
         InputError: a line is asked for and a curve has too few samples before first touch.
@@ -63,7 +65,7 @@ def resolved(
     looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
     if not (wanted or looked):
         return Resolved(_without_flat_line(table), {}, None, {})
-    zeros = zeros_of(curves, sigma, table)
+    zeros = zeros_of(curves, sigma, table) if zeros is None else zeros
     if wanted:
         for curve, reason in zip(curves, without_line(curves, zeros), strict=True):
             if reason is not None:
@@ -107,8 +109,8 @@ def zeros_of(
     held = {p.name: p.value for p in table if p.fixed and not p.auto}
     onset, offset = held.get("onset", 0.0), held.get("force_offset", 0.0)
     zeros = record_zeros(
-        [c.displacement - onset for c in curves],
-        [c.force - offset for c in curves],
+        [c.displacement - onset if onset else c.displacement for c in curves],
+        [c.force - offset if offset else c.force for c in curves],
         np.array([np.nan if s is None else s for s in given]),
     )
     at_zero = np.where(zeros.force_slope, zeros.offset - zeros.slope * onset, zeros.offset)

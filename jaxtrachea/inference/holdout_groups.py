@@ -49,7 +49,7 @@ def with_holdout_groups(
                 key=str(i),
                 cure="name trials of one specimen, or leave the group out",
             )
-    return with_recipe(study, tuple(tuple(group) for group in groups))
+    return with_recipe(study, holdout_groups=tuple(tuple(group) for group in groups))
 
 
 def _ensure_trial(name: str, names: Sequence[str], key: str) -> None:

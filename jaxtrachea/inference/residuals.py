@@ -15,13 +15,13 @@ def rms(values: np.ndarray) -> np.ndarray | np.floating:
 
 def worst(prediction: Prediction, result: FitResult) -> str:
     """The largest force residual in words."""
-    size = np.where(np.isfinite(prediction.force), np.abs(prediction.force), -1)
-    lane, trial, sample = np.unravel_index(np.argmax(size), size.shape)
-    curves = result.study.curves[lane]
-    if size[lane, trial, sample] < 0:
+    largest = [np.max(np.abs(r), where=np.isfinite(r), initial=-1) for r in prediction.force]
+    lane = int(np.argmax(largest))
+    if largest[lane] < 0:
         return "none, no finite prediction"
-    curve = curves[trial]
-    value = prediction.force[lane, trial, sample]
+    force = prediction.force[lane]
+    trial, sample = np.argwhere(np.abs(force) == largest[lane])[0]
+    curve, value = result.study.curves[lane][trial], force[trial, sample]
     return (
         f"{value:+.3g} N at {curve.displacement[sample]:.3g} mm in {curve.specimen} "
         f"{curve.trial}, where {curve.force[sample]:.4g} N were measured"

@@ -50,8 +50,8 @@ _SHAPE = ("k_1", "k_3", "c", "q")
 _HINT, FEW = 12.0, 6
 #: Samples from which the noise of a record is known well.
 _LONG_RECORD = 40
-#: Records looked at, and fitted, together.
-_TOGETHER, _FITTED_TOGETHER = 1 << 14, 512
+#: Samples looked at, and records fitted, together.
+_TOGETHER, _FITTED_TOGETHER = 1 << 18, 512
 
 
 class Zeros(NamedTuple):
@@ -105,9 +105,9 @@ def record_zeros(
     )  # fmt: skip
     lengths = np.array([len(d) for d in displacement], int)
     for length in np.unique(lengths):
-        every = np.flatnonzero(lengths == length)
-        for begin in range(0, len(every) if length >= _FEWEST else 0, _TOGETHER):
-            rows = every[begin : begin + _TOGETHER]
+        every, together = np.flatnonzero(lengths == length), max(1, _TOGETHER // max(length, 1))
+        for begin in range(0, len(every) if length >= _FEWEST else 0, together):
+            rows = every[begin : begin + together]
             D, F = (np.stack([v[i] for i in rows]) for v in (displacement, force))
             part = _of_equal_length(D, F, given[rows])
             for whole, values in zip(out, part, strict=True):

@@ -19,8 +19,9 @@ from jaxtrachea.report.captions import captions
 from jaxtrachea.report.fit_pictures import draw_force, draw_joints
 from jaxtrachea.report.shown import Shown, along, position_signs
 
-#: Residuals that bands are made of at most, intervals of displacement, and samples in one at least.
-BANDED, BINS, FEWEST = 400_000, 60, 20
+#: Residuals of many lanes that are drawn, about, since more tell the same; intervals of
+#: displacement, and samples in one at least.
+DRAWN, BINS, FEWEST = 400_000, 60, 20
 #: Lanes of a waterfall at most; share of the cost up to which two starts end in one minimum.
 FALLS, SAME = 8, 1e-6
 
@@ -83,14 +84,16 @@ def draw_residuals(shown: Shown):
         lanes = [lane for lane in worst_first(result) if result.succeeded[lane]]
     lined = set(lanes[: ONE_BY_ONE // 2] if many else lanes)
     pooled, depths, lines, head = [], [], [], ""
+    part, rng = DRAWN / max(result.samples.sum(), 1), np.random.default_rng(0)
     for lane in lanes:
         for t, curve in enumerate(result.study.curves[lane]):
             n = len(curve.force)
             peak = np.max(np.abs(curve.force))
             r = 100 * prediction.force[lane, t, :n] / (peak if peak > 0 else 1)
-            pooled.append(r)
             x, head = along(curve)
-            depths.append(x)
+            drawn = rng.random(n) < part if many and part < 1 else slice(None)
+            pooled.append(r[drawn])
+            depths.append(x[drawn])
             if lane in lined:
                 lines.append((x, r, shown.colour(curve.s_c)))
     values, depth = np.concatenate(pooled), np.concatenate(depths)
@@ -113,7 +116,8 @@ def draw_residuals(shown: Shown):
     figure.legend(handles=signs, loc="upper left", ncols=9, fontsize=7, borderaxespad=0.3)
     beyond = int(np.sum(np.abs(values) > limit))
     right.hist(np.clip(values, -limit, limit), bins=np.linspace(-limit, limit, 61), color="0.4")
-    more = f"{beyond} of {len(values)} beyond the scale" if beyond else ""
+    drawn = f"{len(values)} drawn" if many and part < 1 else f"{len(values)}"
+    more = f"{beyond} of {drawn} beyond the scale" if beyond else ""
     right.set(xlabel="residual / peak [%]", ylabel="samples", title=more)
     return figure
 
@@ -160,9 +164,6 @@ def _scale(values: np.ndarray) -> float:
 
 def _draw_bands(axis, depth, values) -> list[Any]:
     """Median and the middle 50 and 95 % of residuals along the press; what stands for them."""
-    if len(values) > BANDED:  # as many tell the same
-        drawn = np.random.default_rng(0).integers(len(values), size=BANDED)
-        depth, values = depth[drawn], values[drawn]
     if not len(depth) or not np.ptp(depth) > 0:
         return []
     # As many samples in each interval, so that the bands have no gap where samples are few.

@@ -53,6 +53,7 @@ def arrays_of(result: FitResult, *, weighed: bool = False) -> dict[str, np.ndarr
         study = as_weighed(result.study)
         assert study.shares is not None
         found = study.shares._asdict() | {"precision": np.asarray(study.lanes.precision)}
+        del found["plain"]  # the study has it
         arrays |= {f"shares.{name}": v for name, v in found.items() if v is not None}
     return arrays
 
@@ -83,7 +84,8 @@ def _with_noise_found(study: Study, arrays: dict[str, np.ndarray]) -> Study:
     if "shares.share" not in arrays:
         return study if study.shares else dataclasses.replace(study, force_share=None)
     sigma = arrays.get("shares.sigma")
-    shares = Shares(arrays["shares.share"], sigma, arrays["shares.plain"])
+    plain = np.asarray(study.lanes.precision) if study.shares is None else study.shares.plain
+    shares = Shares(arrays["shares.share"], sigma, plain)
     precision = arrays["shares.precision"]
     if precision.shape != study.lanes.precision.shape:
         raise ValueError(f"shares.precision has shape {precision.shape}")

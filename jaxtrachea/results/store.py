@@ -6,7 +6,7 @@ Numbers and JSON (as bytes) only; `read` makes the study of them again.
 import dataclasses
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -115,37 +115,46 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
     group["direction"] = np.array([c.direction for c in curves], np.float64)
     blend = study.lanes.blend
     group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in rows])
-    seen = result.residuals
-    residual = [seen.force[k, t, : len(c.force)] for k, t, c in rows]
-    columns = {
-        "displacement": [c.displacement for c in curves],
-        "force": [c.force for c in curves],
-        "sigma": [np.full(len(c.force), np.nan) if c.sigma is None else c.sigma for c in curves],
-        "residual": residual,
-        "predicted": [c.force + r for c, r in zip(curves, residual, strict=True)],
-    }
+    if study.model.relaxes:
+        group["rise"] = np.array([c.rise or (0, len(c.force)) for c in curves], np.int64)
+    for name, values in _columns(result, rows):
+        group.create_dataset(name, data=values, **_packing(values))
+
+
+def _columns(
+    result: FitResult, rows: list[tuple[int, int, Curve]]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Columns of samples end to end, one after the other: all at once take as much as the study."""
+    study, seen = result.study, result.residuals
+    curves = [c for _, _, c in rows]
+
+    def of(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values[k, t, : len(c.force)] for k, t, c in rows])
+
+    force, residual = np.concatenate([c.force for c in curves]), of(seen.force)
+    yield "displacement", np.concatenate([c.displacement for c in curves])
+    yield "force", force
+    unknown = np.full(max(len(c.force) for c in curves), np.nan)
+    sigma = [unknown[: len(c.force)] if c.sigma is None else c.sigma for c in curves]
+    yield "sigma", np.concatenate(sigma)
+    yield "residual", residual
+    yield "predicted", force + residual
     if seen.joints is not None and study.lanes.joints is not None:
-        found = [seen.joints[k, t, : len(c.force)] for k, t, c in rows]
-        columns["joint_residual"] = found
-        columns["joints"] = [_on_rings(c, study.model.geometry.rings) for c in curves]
+        yield "joint_residual", of(seen.joints)
+        rings = study.model.geometry.rings
+        yield "joints", np.concatenate([_on_rings(c, rings) for c in curves])
     if seen.side_force is not None:
-        found = [seen.side_force[k, t, : len(c.force)] for k, t, c in rows]
-        given = [_side(c) for c in curves]
-        columns["side_force"], columns["side_residual"] = given, found
-        columns["side_predicted"] = [F + r for F, r in zip(given, found, strict=True)]
+        given, found = np.concatenate([_side(c) for c in curves]), of(seen.side_force)
+        yield "side_force", given
+        yield "side_residual", found
+        yield "side_predicted", given + found
     for kind in markers(study.lanes):
         left = getattr(seen, kind.name)
-        if kind.name == "joints" or left is None:
-            continue
-        used = np.where(kind.precision > 0, kind.data, np.nan)
-        columns[kind.name] = [used[k, t, : len(c.force)] for k, t, c in rows]
-        columns[f"{kind.name}_residual"] = [left[k, t, : len(c.force)] for k, t, c in rows]
+        if kind.name != "joints" and left is not None:
+            yield kind.name, of(np.where(kind.precision > 0, kind.data, np.nan))
+            yield f"{kind.name}_residual", of(left)
     if study.model.relaxes:
-        columns["time"] = [c.time for c in curves]
-        group["rise"] = np.array([c.rise or (0, len(c.force)) for c in curves], np.int64)
-    for name, parts in columns.items():
-        values = np.concatenate(parts)
-        group.create_dataset(name, data=values, **_packing(values))
+        yield "time", np.concatenate([c.time for c in curves if c.time is not None])
 
 
 def _packing(values: np.ndarray) -> dict[str, Any]:

@@ -4,12 +4,13 @@ import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from jaxtrachea._memory import give_back
 from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
@@ -84,6 +85,7 @@ def fit_shards(
 
         result = fit(part.take(shards[k]), settings, tell)
         save(run.shard(k), run.manifest, shards[k], result)
+        give_back()
 
     _in_threads(one, todo, devices)
 
@@ -158,11 +160,7 @@ def collect(run: RunFolder, study: Study) -> FitResult:
         NoRun: a shard cannot be read back, or the result before the rerun has changed.
     """
     part = fitted_lanes(run, study)
-    found = [_read(run, k, part.take(lanes), lanes) for k, lanes in enumerate(shards_of(run, part))]
-    if any(result is None for result in found):
-        k = next(k for k, result in enumerate(found) if result is None)
-        raise NoRun(f"{run.shard(k)} cannot be read")
-    result = join(part, [result for result in found if result is not None])
+    result = join(part, _every_shard(run, part))
     again = run.manifest.rerun
     if again is None:
         return result
@@ -170,6 +168,14 @@ def collect(run: RunFolder, study: Study) -> FitResult:
     if digest(path) != again.results:
         raise NoRun(f"{path} has changed since its failed lanes were fitted again")
     return replaced(read_again(path, study), np.array(again.lanes), result)
+
+
+def _every_shard(run: RunFolder, part: Study) -> Iterator[FitResult]:
+    """The results of all shards, one after the other."""
+    for k, lanes in enumerate(shards_of(run, part)):
+        if (found := _read(run, k, part.take(lanes), lanes)) is None:
+            raise NoRun(f"{run.shard(k)} cannot be read")
+        yield found
 
 
 def write_so_far(path: Path, run: RunFolder, study: Study) -> None:

@@ -10,6 +10,7 @@ import io
 import json
 import os
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -104,11 +105,15 @@ def free_memory(workers: int) -> float:
     return np.inf
 
 
-def join(study: Study, parts: list[FitResult]) -> FitResult:
+def join(study: Study, parts: Iterable[FitResult]) -> FitResult:
     """One result out of those of consecutive lanes; `study` holds all of them."""
-    weighed = any(part.study.shares is not None for part in parts)
-    each = [arrays_of(part, weighed=weighed) for part in parts]
-    return result_of(study, {name: np.concatenate([a[name] for a in each]) for name in each[0]})
+    each, weighed = [], False
+    for part in parts:
+        weighed |= part.study.shares is not None
+        each.append(arrays_of(part, weighed=True))
+    names = [n for n in each[0] if weighed or not n.startswith("shares.")]
+    # Those of the parts go as they are joined: together they are as large as the study.
+    return result_of(study, {n: np.concatenate([a.pop(n) for a in each]) for n in names})
 
 
 def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
