@@ -63,7 +63,7 @@ def _note_unused_batch(spec, study, printed: set[str]) -> None:
 
 def _samples_once(measurements, study):
     """Both with curves whose displacements and forces are those of the lanes, not copies."""
-    from jaxtrachea.fitting.study import with_recipe
+    from jaxtrachea.fitting.build import with_recipe
 
     def shared(curve, k: int, t: int):
         arrays = {n: getattr(study.lanes, n)[k, t, : len(curve.force)] for n in SAMPLES}
