@@ -94,6 +94,7 @@ def test_resampled_residuals_have_the_variance_of_the_noise():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_influence_of_a_curved_model_is_that_of_refits():
     """k_1 in series with the skeleton beside a fixed k_3: residuals change the curvature."""
     changes = {"k_3": {"lower": 0.0, "value": 0.3, "fixed": True}}
@@ -215,6 +216,7 @@ def test_each_end_moves_on_its_own_spring():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_a_free_end_moves_as_the_contact_does():
     """All vertices were NaN there, with status OK. The limit of weak springs, and its derivative.
 

@@ -181,6 +181,7 @@ def sandwich_errors(theta, presses, balance):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_expected_errors_are_those_of_the_refit():
     """Curves of 15 to 120 samples: errors before and after two presses, and those of a refit.
 
@@ -235,6 +236,7 @@ def log_volume(result):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_a_joint_fit_presses_the_specimen_that_tells_most():
     """Gains of a press on each specimen are those of refits with it; the first was always taken."""
     study = joint_study(k_1="specimen")
@@ -304,6 +306,7 @@ def late_study(onset, late=10.0):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_depths_of_presses_are_from_first_touch():
     """Records from 8 to 13 mm that touch at 10 mm: presses of 3 mm; 13 mm were taken for them."""
     study = late_study({})
@@ -324,6 +327,7 @@ def test_depths_of_presses_are_from_first_touch():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_where_a_record_has_its_zero_tells_nothing():
     """A press as deep tells the same whatever the displacement at first touch; it told nothing."""
     candidates = Candidates(np.array([51.0, 75.0]), np.array([3.0, 3.0]))

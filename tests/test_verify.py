@@ -246,6 +246,7 @@ def test_no_doubt_costs_nothing(study, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_truth_table():
     """50 specimens at 0.2 and 2 % noise: at most 5 % have an unknown falsely identifiable.
 

@@ -25,6 +25,7 @@ from jaxtrachea.measurements.vectors import (
     unit_direction,
     vectors_of,
 )
+from jaxtrachea.measurements.whole_record import SPEEDS, speed_of
 
 #: Samples that are looked at together: their arrays stay in the cache of a processor.
 BLOCK = 2**17
@@ -208,7 +209,7 @@ def _curve(
     common: tuple[float | None, float | None],
     options: ReadOptions,
 ) -> Curve | None:
-    """The curve of a plain record; None if its position, direction or vectors are odd."""
+    """The curve of a plain record; None if its position, direction, vectors or speed are odd."""
     some = any(getattr(raw, name) is not None for name in FURTHER_FIELDS)
     start, stop = block.edges[k : k + 2]
     size = stop - start
@@ -222,6 +223,9 @@ def _curve(
     except Fault:
         return None
     if abs(phi_c) > 2 * math.pi:
+        return None
+    speed = 0.0 if raw.time is None else speed_of(raw.time, block.displacement[start:stop])
+    if speed > 0 and not SPEEDS[0] <= speed <= SPEEDS[1]:
         return None
     low, high = block.low[k], block.high[k]
     doubtful = implausible_extent(high - low, block.peak[k])

@@ -257,6 +257,7 @@ def late_study(onset, offset, late=(10.0, 10.3), zero=0.0):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_extrapolated_and_tested_are_depths_from_first_touch(tmp_path):
     """Presses of 1 mm, recorded from 8 to 11 mm; what was said was held against these 11 mm."""
     late = (10.0, 10.3)
@@ -312,6 +313,7 @@ def law_error(scope, D):
     return np.sqrt(np.einsum("in,ij,jn->n", x, covariance, x))
 
 
+@pytest.mark.compiling
 @pytest.mark.parametrize("scope", ["specimen", *late("trial")])
 def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_path):
     """Closed form. A zero that is held, or of a specimen, was taken for that of the new press."""

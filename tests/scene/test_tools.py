@@ -37,6 +37,8 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 OK, NO_CONTACT, LIFTED = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.LIFTED
 #: Round, with a vertex at 70 and 75 mm on the midline.
 ROUND = make_tube(TUBE, around=9, along=40, relief=0.0)
