@@ -304,7 +304,7 @@ def slide_at(
 def stored_at(
     place: Place, displacement: Float[Array, "3"], options: ObliqueOptions
 ) -> Float[Array, ""]:
-    """Elastic energy of a press that sticks (unilateral, `series`), N mm."""
+    """Elastic energy of a press, N mm, also of one that would pull."""
     glued = dataclasses.replace(options.press, contact="bonded")
     return energy_at(place, press_at(place, displacement, glued))
 
