@@ -301,20 +301,6 @@ def slide_at(
     return _path_of(place, jax.tree.map(lambda v: v[None], slid), refused), slid.slip
 
 
-def stored_at(
-    place: Place, displacement: Float[Array, "3"], options: ObliqueOptions
-) -> Float[Array, ""]:
-    """Elastic energy of a press that sticks (unilateral, `series`), N mm."""
-    glued = dataclasses.replace(options.press, contact="bonded")
-    return energy_at(place, press_at(place, displacement, glued))
-
-
-def energy_at(place: Place, press: ObliquePress) -> Float[Array, "*n"]:
-    """Elastic energy of a press, N mm: of the local law and of the skeleton."""
-    squared = jnp.sum(press.depth * press.depth, axis=-1)
-    return place.law.energy(squared) + jnp.sum(press.force * press.skeleton, axis=-1) / 2
-
-
 def _rubbed(place: Place, displacement: Float[Array, "n 3"], friction: Coulomb, options):
     """Displacements and compliance in the contact's frame, friction to compute with, refusals."""
     mu = jnp.asarray(friction.mu)

@@ -33,11 +33,15 @@ class Slip(NamedTuple):
         held: on the place that it holds; shape (2,).
         before: on the places before; shape (2,).
         stored: elastic energy of the press, N mm.
+        force: of the press, N; shape (3,).
+        depth: its local indentation, mm; shape (3,).
     """
 
     held: Float[Array, "2"]
     before: Float[Array, "2"]
     stored: Float[Array, ""]
+    force: Float[Array, "3"]
+    depth: Float[Array, "3"]
 
 
 class Grip(NamedTuple):

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import product
 from jaxtrachea.mechanics.friction import Coulomb
-from jaxtrachea.mechanics.oblique import Place, energy_at, slide_at, stored_at
+from jaxtrachea.mechanics.oblique import Place, slide_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import (
     MAX_MISMATCH,
@@ -51,7 +51,8 @@ from jaxtrachea.trachea.material import Material
 
 def no_slip(dtype) -> Slip:
     """Before the first touch."""
-    return Slip(jnp.zeros(2, dtype), jnp.zeros(2, dtype), jnp.zeros((), dtype))
+    none = jnp.zeros(3, dtype)
+    return Slip(none[:2], none[:2], none[0], none, none)
 
 
 def rub(
@@ -86,9 +87,10 @@ def rub(
     # The press before this step, on the place and with the depth that it has now.
     before = press_vector(scene, anchor, last.path) + way - led
     changed = on & (follows | (inward != led[0]))
-    given_up = _energy_lost(scene, state.slip, place, jnp.where(changed, before, 0))
-    given_up = jnp.where(changed, given_up, 0)
-    total = slip._replace(held=slip.held + slid, stored=energy_at(place, path.press)[0])
+    given_up = jnp.where(changed, _energy_lost(state.slip, place, product(frame.T, before)), 0)
+    force, depth_C = path.press.force[0], path.press.depth[0]
+    stored = _energy(place, force, depth_C)
+    total = slip._replace(held=slip.held + slid, stored=stored, force=force, depth=depth_C)
     nothing = jnp.zeros(1, way.dtype)
     held = anchor._replace(body=anchor.body + share * rolled)
 
@@ -110,9 +112,21 @@ def rub(
     )
 
 
-def _energy_lost(scene: Scene, slip: Slip, place: Place, way: Float[Array, "3"]):
-    """What the press stored in the step before, and does not on this place, N mm."""
-    there = stored_at(place, product(local_frame(place.phi_c).T, way), scene.plan.oblique)
+def _energy(place: Place, force: Float[Array, "3"], depth: Float[Array, "3"]):
+    """Elastic energy of a press, N mm: of the local law, and of the skeleton."""
+    yielding = jnp.sum(force * product(place.unit.compliance, force))
+    return place.law.energy(jnp.sum(depth * depth)) + yielding / 2
+
+
+def _energy_lost(slip: Slip, place: Place, way: Float[Array, "3"]):
+    """What the press stored in the step before, and does not on this place, N mm.
+
+    W(d) + F . (D - d) - F . C F / 2 is stationary in F and d, where it is the energy: so those of
+    the step before give that of this place up to the square of the change.
+    """
+    force, depth = slip.force, slip.depth
+    yielding = jnp.sum(force * product(place.unit.compliance, force))
+    there = _energy(place, force, depth) + jnp.sum(force * (way - depth)) - yielding
     lost = slip.stored - there
     return jnp.where(jnp.isfinite(lost), lost, 0)
 

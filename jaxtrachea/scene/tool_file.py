@@ -109,11 +109,11 @@ def _neighbours(vertices, faces) -> Int[np.ndarray, "pairs 2"]:
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     same = unique_rows(np.sort(edges, axis=1))[1]
     order = np.argsort(same, kind="stable")
-    found = [np.zeros((0, 2), int)]
-    for at in np.split(order, np.flatnonzero(np.diff(same[order])) + 1):
-        pairs = at[None] if len(at) == 2 else _across(vertices, faces, edges, at)
-        found.append(np.asarray(pairs) // 3)
-    return np.concatenate(found)
+    twice = np.bincount(same)[same[order]] == 2
+    found, others = [order[twice].reshape(-1, 2)], order[~twice]
+    for at in np.split(others, np.flatnonzero(np.diff(same[others])) + 1):
+        found.append(_across(vertices, faces, edges, at))
+    return np.concatenate(found) // 3
 
 
 def _across(vertices, faces, edges, at):
@@ -122,10 +122,10 @@ def _across(vertices, faces, edges, at):
     Triangles turn their fronts outwards, so that the inside of one that runs up the edge is
     clockwise of it. All are paired where as many do not run down as up: no closed bodies.
     """
-    low, high = np.sort(edges[at[0]])
-    up = edges[at, 0] == low
-    if up.sum() != (~up).sum():
+    up = edges[at, 0] < edges[at, 1]
+    if up.sum() != (~up).sum() or len(at) == 0:
         return np.stack([at[:-1], at[1:]], axis=1)
+    low, high = np.sort(edges[at[0]])
     along = vertices[high] - vertices[low]
     third = faces[at // 3].sum(axis=1) - edges[at].sum(axis=1)
     out = np.cross(along, vertices[third] - vertices[low])
