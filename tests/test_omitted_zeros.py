@@ -8,9 +8,9 @@ import pytest
 from run_cli import run
 from scipy.signal import lfilter
 
-from jaxtrachea.fitting import omitted_zeros
+from jaxtrachea.fitting import build, omitted_zeros
 from jaxtrachea.fitting.assessment import assess
-from jaxtrachea.fitting.build import build_study
+from jaxtrachea.fitting.build import build_study, with_zeros
 from jaxtrachea.fitting.fit import fit, with_omitted_zeros
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.zero_messages import sentences_of_fits
@@ -136,11 +136,38 @@ def test_lanes_that_are_not_looked_at_one_by_one_would_ask_for_nothing(mixed):
     _, plain, _ = mixed
     lanes = np.arange(plain.lanes)
     columns, able = columns_of(plain, lanes), np.ones((plain.lanes, 2, 1), bool)
-    chosen = [bool(omitted_zeros._chosen(plain, columns, n, able[n])) for n in lanes]
+    chosen = [bool(omitted_zeros._chosen(plain, columns, n, able[n])) for n in lanes.tolist()]
     may = omitted_zeros._may_ask(plain, columns, able)
     assert any(chosen)
     assert not may.all()
     assert may[chosen].all()
+
+
+def test_lanes_looked_at_a_few_at_a_time_ask_for_the_same(mixed, monkeypatch):
+    _, plain, result = mixed
+    every = np.arange(plain.lanes)
+    found = omitted_zeros.asked_for(plain, every)
+    assert found.names == {k: v for k, v in result.study.recipe.asked.items() if v}
+    monkeypatch.setattr(omitted_zeros, "TOGETHER", 5)
+    assert omitted_zeros.asked_for(plain, every) == found
+
+
+def test_a_study_with_further_zeros_is_as_built_from_its_records():
+    """What its records show is not looked for again; displacements and forces are not copied."""
+    rng = np.random.default_rng(3)
+    curves = [soft(rng, name, air) for name, air in (("T01", 0.2), ("T00", 0.2), ("T01", 1.5))]
+    curves[2] = dataclasses.replace(curves[2], trial="2")
+    study = build_study(curves, table_1(), TOTAL, K_5)
+    asked = {("T00", "1"): {"onset"}}
+    found = with_zeros(study, asked)
+    assert np.shares_memory(found.lanes.force, study.lanes.force)
+    anew = dataclasses.replace(study.recipe, asked=asked, zeros=None)
+    expected = build._built([c for lane in study.curves for c in lane], anew)
+    assert found.unknowns == expected.unknowns
+    assert [lane[-1][0].name for lane in found.unknowns] == ["onset", "onset"]
+    for name, values in expected.lanes._asdict().items():
+        np.testing.assert_array_equal(getattr(found.lanes, name), values, err_msg=name)
+    np.testing.assert_array_equal(found.record_zeros, expected.record_zeros)
 
 
 def test_a_model_that_misses_the_curve_asks_for_nothing():

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from jaxtrachea._memory import give_back
 from jaxtrachea.cli.beside import beside, load_beside
 from jaxtrachea.cli.terminal import Stages, Stop, progress_bar, say_lost, table, to_stderr
 
@@ -43,6 +44,7 @@ def run(request, stop_if_asked, fit=None):
             result = with_omitted_zeros(asked[0], result, asked[1], progress)
         findings = analyse(request, result, stages.begin)
         stages.close()
+        give_back()
         return findings
 
 

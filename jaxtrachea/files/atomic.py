@@ -126,10 +126,12 @@ def hdf5_file(path: Path, mode: str = "x") -> Iterator[Any]:
             shutil.copyfile(path, beside)
         with beside.open("w+b" if mode == "x" else "r+b", buffering=0) as stream:
             image = _Image(stream)
-            with h5py.File(image, "w" if mode == "x" else mode) as file:
-                yield file
-            if image.error is not None:
-                raise image.error
+            try:
+                with h5py.File(image, "w" if mode == "x" else mode) as file:
+                    yield file
+            finally:
+                if image.error is not None:
+                    raise image.error
             os.fsync(stream.fileno())
 
 

@@ -49,6 +49,6 @@ def predictions(
     for kind in forces(lanes) + markers(lanes):
         after = first + lanes.force.shape[-1] * kind.places
         part, first = value[..., first:after].reshape(kind.data.shape), after
-        with np.errstate(invalid="ignore", divide="ignore"):
-            found[kind.name] = np.where(kind.precision > 0, part / kind.precision, np.nan)
+        residual = np.full(part.shape, np.nan)
+        found[kind.name] = np.divide(part, kind.precision, out=residual, where=kind.precision > 0)
     return Prediction(**found)

@@ -26,15 +26,16 @@ def sizes_of_press(study: Study) -> Float[np.ndarray, "lanes P"]:
     columns = _columns(study)
     if not columns:
         return out
-    lanes = study.lanes
-    seen = lanes.precision > 0
+    seen = np.asarray(study.lanes.precision) > 0
 
-    def pick(v, fill):
-        return np.where(seen, v, fill)
+    def ends(v):
+        low = np.min(v, axis=2, where=seen, initial=np.inf)
+        return low, np.max(v, axis=2, where=seen, initial=-np.inf)
 
-    span = np.max(pick(lanes.displacement, -np.inf), axis=2)
-    span = span - np.min(pick(lanes.displacement, np.inf), axis=2)
-    peak = np.max(pick(np.abs(lanes.force), -np.inf), axis=2)
+    low, high = ends(np.asarray(study.lanes.displacement))
+    span = high - low
+    low, high = ends(np.asarray(study.lanes.force))
+    peak = np.maximum(high, -low)
     slope = peak / np.where(span > 0, span, np.nan)
     sizes_of = {"onset": span, "force_offset": peak, "force_slope": slope}
     for name, column, step in columns:

@@ -71,7 +71,7 @@ def test_a_folder_that_became_read_only(peace, study, monkeypatch, capsys):
 
 
 def test_hdf5_on_a_full_disk(tmp_path):
-    """The HDF5 library itself ends the process there: files are put together in memory."""
+    """The HDF5 library itself ends the process there: it is not told."""
     code = f"""
 import resource
 from pathlib import Path
