@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -33,8 +32,6 @@ def imported(mesh):
 
 
 MESHES = {k: imported(make_tube(TUBE, around=35 * k, along=97 * k)) for k in (1, 2, 4)}
-#: Height of the facets of the coarse mesh over those of the finer ones, midway between vertices.
-FACET = 12.6 * (1 - np.cos(np.pi / 35))
 ROWS = 41
 
 
@@ -98,15 +95,6 @@ def spacings():
     return found
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm(spacings):
-    """Between its vertices a coarse mesh is flat, up to R (1 - cos(pi / 35)) lower: 0.05 mm."""
-    limits = {"on vertices": 0.03, "between": FACET}
-    for (where, limit), depth in itertools.product(limits.items(), (0.1, 3.0)):
-        assert np.ptp(spacings[where, depth][0], axis=0).max() < limit
-
-
 @pytest.mark.parametrize("along", [40, 97, 111])
 def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
     geometry = Geometry.create(93.0, [11.3, 20.1, 33.3, 41.9, 57.0, 71.7], radius=10.0)
@@ -115,24 +103,6 @@ def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
     for ring in np.asarray(geometry.ring_positions):
         height = np.asarray(mesh.distance)[front & (np.abs(np.asarray(mesh.s) - ring) < 1e-9)]
         np.testing.assert_allclose(height, 11.0, rtol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_the_measure_is_the_gap_of_touch():
-    """The same balls by `touch`, which smooths by at most its bound."""
-    wall = walls_.patches_of_wall(TUBE, MESHES[1])
-    centres, _, radius = wall_check._balls(MESHES[1], TUBE, ROWS)
-    seen = wall_check.measure(MESHES[1], TUBE, wall, ROWS)
-    difference = pressed(wall, centres, radius)[0] - (seen.gap + seen.error)
-    assert difference.max() < 1e-3
-    assert difference.min() > -0.09
-    mesh = trimesh.Trimesh(MESHES[1].vertices, MESHES[1].faces, process=False)
-    every = trimesh.triangles.closest_point(
-        np.tile(mesh.triangles, (5, 1, 1)), np.repeat(centres[:5], len(mesh.faces), 0)
-    ).reshape(5, -1, 3)
-    distance = np.linalg.norm(every - centres[:5, None], axis=2).min(axis=1)
-    np.testing.assert_allclose(seen.gap[:5], distance - radius, atol=1e-12)
 
 
 def test_distance_to_triangles_of_very_different_sizes():
