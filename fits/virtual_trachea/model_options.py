@@ -16,8 +16,9 @@ import numpy as np
 
 from jaxtrachea.cli.specification import settings_of, study_of
 from jaxtrachea.config import FitSpec, load_fit_spec
+from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.result import FitResult, assess
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.cross_validation import leave_one_out, refitted
 from jaxtrachea.inference.labels import peak_force

@@ -13,10 +13,10 @@ import pandas as pd
 import pyvisco
 from relaxing_coverage import GAMMA, KNOWN, PLACES, TAU, TUBE, UNIFORM, compliance, relaxing_records
 
+from jaxtrachea.fitting.assessment import assess
+from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.result import assess
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.curve import Curve
 
 RAMP, HOLD, NOISE = 0.5, 100.0, 0.003

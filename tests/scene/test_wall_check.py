@@ -2,21 +2,24 @@
 
 import dataclasses
 import functools
+import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 from small_scenes import BALL, SPRINGS, bend, poses
 
-from jaxtrachea import EffectOptions, make_scene, table_1
+from jaxtrachea import EffectOptions, Poses, make_scene, simulate, table_1
 from jaxtrachea.config import SpecError
-from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.scene import wall as walls_
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import with_mesh
 from jaxtrachea.scene.build import stage as read_scene
 from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import MeshError
 from jaxtrachea.trachea.tube import make_tube
@@ -30,6 +33,29 @@ def imported(mesh):
 
 
 MESHES = {k: imported(make_tube(TUBE, around=35 * k, along=97 * k)) for k in (1, 2, 4)}
+#: Height of the facets of the coarse mesh over those of the finer ones, midway between vertices.
+FACET = 12.6 * (1 - np.cos(np.pi / 35))
+ROWS = 41
+
+
+def filled_up(tube):
+    """The same patches, and one far away for each that lacks, so that all share one program."""
+    cores = np.asarray(tube.shapes.vertices)
+    inside = np.repeat(cores.mean(axis=2, keepdims=True), walls_.CORNERS - cores.shape[2], 2)
+    lacking = TUBE.rings - len(cores)
+
+    def longer(v, away=0.0):
+        return np.concatenate([v, np.repeat(v[:1], lacking, 0) + away])
+
+    cores = longer(np.concatenate([cores, inside], axis=2), 1e4)
+    uncertain = np.zeros(TUBE.rings, bool)
+    if tube.uncertain is not None:
+        uncertain[: len(tube.uncertain)] = tube.uncertain
+    return dataclasses.replace(
+        tube, shapes=Shape(jnp.asarray(cores), jnp.asarray(longer(tube.shapes.radius))),
+        centres=jnp.asarray(longer(tube.centres, 1e4)), lost=jnp.asarray(longer(tube.lost)),
+        filled=jnp.asarray(longer(tube.filled)), uncertain=jnp.asarray(uncertain),
+    )  # fmt: skip
 
 
 @functools.cache
@@ -43,6 +69,44 @@ def scene():
     return make_scene(TUBE, SPRINGS, path, tool=sphere(6.0), radius=12.6, effects=effects)
 
 
+run = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+
+
+def pressed(tube, centres, radius=6.0):
+    """The scene on this wall, `ROWS` poses at a time."""
+    many = np.concatenate([centres, np.repeat(centres[-1:], -len(centres) % ROWS, 0)])
+    here = dataclasses.replace(scene(), tube=filled_up(tube), tool=sphere(radius), near=3)
+    turn, parts = jnp.tile(jnp.eye(3), (ROWS, 1, 1)), []
+    for at in many.reshape(-1, ROWS, 3):
+        out = run(here, SPRINGS, Poses(turn, jnp.asarray(at)))
+        parts.append((out.gap, out.force[:, 1], out.force[:, 2], out.status))
+    return [np.concatenate(v)[: len(centres)] for v in zip(*parts, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def spacings():
+    """Gap and force along the front and midway between vertices, light and 3 mm deep."""
+    s, found = np.linspace(70, 80, ROWS), {}
+    walls = [walls_.patches_of_wall(TUBE, mesh) for mesh in MESHES.values()]
+    for name, phi in (("on vertices", 0.0), ("between", np.pi / 35)):
+        for depth in (0.1, 3.0):
+            height = 18.6 - depth
+            at = np.stack([s, 0 * s + height * np.cos(phi), 0 * s + height * np.sin(phi)], axis=1)
+            rows = [pressed(wall, at) for wall in walls]
+            assert all((row[3] <= PressStatus.NO_CONTACT).all() for row in rows)
+            found[name, depth] = [np.stack(v) for v in zip(*(row[:3] for row in rows), strict=True)]
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm(spacings):
+    """Between its vertices a coarse mesh is flat, up to R (1 - cos(pi / 35)) lower: 0.05 mm."""
+    limits = {"on vertices": 0.03, "between": FACET}
+    for (where, limit), depth in itertools.product(limits.items(), (0.1, 3.0)):
+        assert np.ptp(spacings[where, depth][0], axis=0).max() < limit
+
+
 @pytest.mark.parametrize("along", [40, 97, 111])
 def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
     geometry = Geometry.create(93.0, [11.3, 20.1, 33.3, 41.9, 57.0, 71.7], radius=10.0)
@@ -51,6 +115,24 @@ def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
     for ring in np.asarray(geometry.ring_positions):
         height = np.asarray(mesh.distance)[front & (np.abs(np.asarray(mesh.s) - ring) < 1e-9)]
         np.testing.assert_allclose(height, 11.0, rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_the_measure_is_the_gap_of_touch():
+    """The same balls by `touch`, which smooths by at most its bound."""
+    wall = walls_.patches_of_wall(TUBE, MESHES[1])
+    centres, _, radius = wall_check._balls(MESHES[1], TUBE, ROWS)
+    seen = wall_check.measure(MESHES[1], TUBE, wall, ROWS)
+    difference = pressed(wall, centres, radius)[0] - (seen.gap + seen.error)
+    assert difference.max() < 1e-3
+    assert difference.min() > -0.09
+    mesh = trimesh.Trimesh(MESHES[1].vertices, MESHES[1].faces, process=False)
+    every = trimesh.triangles.closest_point(
+        np.tile(mesh.triangles, (5, 1, 1)), np.repeat(centres[:5], len(mesh.faces), 0)
+    ).reshape(5, -1, 3)
+    distance = np.linalg.norm(every - centres[:5, None], axis=2).min(axis=1)
+    np.testing.assert_allclose(seen.gap[:5], distance - radius, atol=1e-12)
 
 
 def test_distance_to_triangles_of_very_different_sizes():
