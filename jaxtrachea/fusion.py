@@ -92,7 +92,15 @@ def fuse(part: Callable, *, products: bool = False, streams: bool = False) -> Ca
         return out, jax.tree.map(lambda _: True, out)
 
     call = jax.custom_jvp(alone)
-    call.defjvp(lambda primals, tangents: jax.jvp(part, primals, tangents))
+
+    @call.defjvp
+    def _(primals, tangents):
+        out, slopes = jax.jvp(part, primals, tangents)
+        # Each lane of a batch has all that `alone` gives, what no lane changes too.
+        read = [jnp.ravel(v)[0] for v in jax.tree.leaves(primals)]
+        lane = functools.reduce(jnp.logical_or, [v == v for v in read])
+        return jax.tree.map(lambda v: jnp.where(lane, v, v), out), slopes
+
     return call
 
 
