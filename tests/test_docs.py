@@ -167,7 +167,7 @@ def _at_three_places(out):
     for text in rows.values():
         force = np.array(text.strip("[]").split(), float)
         assert (np.diff(force, prepend=0) > 0).all()
-            assert force[-1] < 20.0 * 6 + 0.5 * 6**3
+        assert force[-1] < 20.0 * 6 + 0.5 * 6**3
 
 
 def _too_stiff(out):
