@@ -136,5 +136,6 @@ def _print(rows) -> None:
         if "left_out" in row:
             text = f"left out: {row['ladder']}: {row['left_out']}"
             out.print(escape(text), highlight=False)
-    for text in load_warning(points[0]["others"]) if points else ():
+    loads = [point["others"] for point in points if point["others"] is not None]
+    for text in load_warning(max(loads, default=None)):
         out.print(text, highlight=False)

@@ -68,6 +68,7 @@ def write_map(path: Path, mesh: Mesh, s: np.ndarray, phi: np.ndarray, out: Sweep
     """Write the wall at rest with a sweep's force (N), compliance (mm/N) and the others.
 
     Linear between the points of the grid; NaN beyond it, and beside a point without a solution.
+    `status` is the `PressStatus` of the nearest point, -1 beyond the grid.
 
     Args:
         path: of a .vtp file.
@@ -82,13 +83,15 @@ def write_map(path: Path, mesh: Mesh, s: np.ndarray, phi: np.ndarray, out: Sweep
     from scipy.interpolate import RegularGridInterpolator
 
     places = np.stack([np.asarray(mesh.s, float), np.asarray(mesh.phi, float)], axis=1)
-    values = {
-        name: RegularGridInterpolator(
-            (s, phi), np.asarray(v, float).reshape(len(s), len(phi)), bounds_error=False
-        )(places)
-        for name, v in out._asdict().items()
-        if name != "status"
-    }
+
+    def on_wall(name, v):
+        grid = np.asarray(v, float).reshape(len(s), len(phi))
+        if name != "status":
+            return RegularGridInterpolator((s, phi), grid, bounds_error=False)(places)
+        near = RegularGridInterpolator((s, phi), grid, "nearest", False, -1)
+        return near(places).astype(np.int32)
+
+    values = {name: on_wall(name, v) for name, v in out._asdict().items()}
     write_text(path, _surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), values))
 
 

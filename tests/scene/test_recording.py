@@ -114,7 +114,8 @@ def test_a_map_on_the_wall_is_read_by_vtk(vtk, tmp_path):
     rest = stored().rest
     s, phi = np.linspace(10.0, 30.0, 5), np.linspace(-1.0, 1.0, 3)
     force = (0.1 + 0.02 * s[:, None] + 0.3 * phi).ravel()
-    out = Sweep(force, force, np.where(force > 0.6, np.nan, 1.0), force, np.zeros(15, int))
+    deep = np.where(force > 0.6, 3, 0)
+    out = Sweep(force, force, np.where(force > 0.6, np.nan, 1.0), force, deep)
     names = ("vertices", "faces", "s", "phi", "distance")
     wall = Mesh(**{k: jnp.asarray(rest[k]) for k in names}, normals=jnp.asarray(rest["vertices"]))
     write_map(tmp_path / "sweep.vtp", wall, s, phi, out)
@@ -122,7 +123,11 @@ def test_a_map_on_the_wall_is_read_by_vtk(vtk, tmp_path):
     reader.SetFileName(str(tmp_path / "sweep.vtp"))
     reader.Update()
     named = reader.GetOutput().GetPointData()
-    assert named.GetNumberOfArrays() == 4
+    status = convert.vtk_to_numpy(named.GetArray("status"))
+    assert (
+        status[~((rest["s"] >= 10) & (rest["s"] <= 30) & (np.abs(rest["phi"]) <= 1))] == -1
+    ).all()
+    assert set(status) == {-1, 0, 3}
     got = convert.vtk_to_numpy(named.GetArray("force"))
     inside = (rest["s"] >= 10) & (rest["s"] <= 30) & (np.abs(rest["phi"]) <= 1)
     assert inside.sum() > 20
