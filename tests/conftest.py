@@ -189,6 +189,6 @@ def pytest_collection_finish():
 def pytest_collection_modifyitems(config, items):
     """Order of the files as CI runs them; --no-loadscope-reorder leaves it so."""
     chosen = config.getoption("markexpr")
-    longest = LONGEST if chosen == "not slow" else LONGEST_SLOW if "slow" in chosen else ()
+    longest = LONGEST_SLOW if chosen.startswith("slow") else LONGEST
     rank = {name: place for place, name in enumerate(longest)}
     items.sort(key=lambda item: rank.get(item.path.name, len(longest)))

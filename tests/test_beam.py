@@ -212,6 +212,7 @@ def test_reactions_same_answer(split, shear):
             np.testing.assert_allclose(p, q, atol=2e-9 * float(peak), rtol=0, err_msg=name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("split", "shear"), [("continuous", True), ("independent", False)])
 def test_derivatives_of_both_forms(split, shear):
     """Between rings, on a ring (from the right, where they jump), and where a ring gives way."""

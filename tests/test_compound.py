@@ -67,6 +67,7 @@ def solve(tool, near, turn, place, dtype="float64"):
     return solver(near)(*jax.tree.map(lambda v: jnp.asarray(v, dtype), given))
 
 
+@pytest.mark.long
 def test_two_halves_are_the_whole():
     """Within the smoothing of the cut: both parts have its vertices and its faces."""
     whole, halves = (solve(v, n, *poses(), "float64") for v, n in ((WHOLE, 3), (HALVES, 6)))
@@ -81,6 +82,7 @@ def test_two_halves_are_the_whole():
     assert np.all(halves.complete)
 
 
+@pytest.mark.long
 def test_the_deeper_part_alone_but_at_ties():
     """And a ball that fills up 8 vertices is a ball."""
     turn, place = poses(1)
@@ -101,6 +103,7 @@ def test_the_deeper_part_alone_but_at_ties():
     assert (pair.gap >= low - np.log(2) / BETA - 1e-12).all()
 
 
+@pytest.mark.long
 def test_a_tie_is_smooth_and_told():
     """Two balls turned through the pose where both are as deep: derivative, and the status."""
     balls = compound([sphere(2.0), sphere(2.0)], [at(-5, 0, 0), at(5, 0, 0)])

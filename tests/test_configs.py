@@ -89,6 +89,7 @@ EARLY = ["no_surface", "normal"]
 EACH = [*EARLY, *late(*(n for n in NAMES if n not in EARLY))]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scene", EACH, indirect=True)
 def test_scene_runs(scene, monkeypatch, capsys):
     monkeypatch.chdir(scene.parent)

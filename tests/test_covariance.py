@@ -44,6 +44,7 @@ def test_covariance_of_a_robust_fit():
     np.testing.assert_allclose(found.se[0], np.sqrt(np.diag(want)), rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
 def test_given_noise_of_a_robust_fit(loss):
     """Errors are the spread of estimates: 4,000 lines with normal noise of the sigma given, scipy.

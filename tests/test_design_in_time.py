@@ -21,6 +21,8 @@ from jaxtrachea.mechanics.press import press
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
+pytestmark = pytest.mark.long
+
 TUBE = Geometry.create(160.0, list(np.arange(10.0, 151.0, 10.0)))
 SOLID = Material(EI_L=20.0, k_M=0.3, k_1=0.6, k_3=0.0)
 K_1, GAMMA, TAU, SIGMA = 0.6, 0.8, 2.0, 0.01

@@ -70,6 +70,7 @@ def moved(data, lane, trial):
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("trial", ["s20", "s80"])
 def test_estimates_of_a_linear_fit_are_those_of_a_refit(section, trial):
     """One Newton step is exact where the model is linear; the page has five digits."""

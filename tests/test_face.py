@@ -49,6 +49,7 @@ def test_public_names_stand_once_and_are_there():
         _ = jt.no_such_name
 
 
+@pytest.mark.long
 def test_no_name_is_hidden_by_a_room():
     """`jt.fit` is the function, also after a module of its room was imported."""
     code = (
@@ -79,6 +80,7 @@ def test_table_holds_the_truth_with_units(result):
         table.column("colour")
 
 
+@pytest.mark.long
 def test_table_prints_aligned_and_escaped(result):
     lines = repr(result.table()).splitlines()
     assert len(lines) == 9
@@ -93,6 +95,7 @@ def test_table_prints_aligned_and_escaped(result):
     assert page.count("<tr>") == 9
 
 
+@pytest.mark.long
 def test_dataset_has_the_same_numbers(result):
     data = result.to_dataset()
     assert dict(data.sizes) == {"lane": 2, "unknown": 4, "kind": 2}
@@ -105,6 +108,7 @@ def test_dataset_has_the_same_numbers(result):
         assert data[name].values.ravel().tolist() == table.column(column)
 
 
+@pytest.mark.long
 def test_dataset_takes_profiles_as_the_table_does():
     """With a bound at 0.8 of the true k_M the estimate lies on it: no error, and no local interval.
 

@@ -100,6 +100,7 @@ def test_given_starts_are_of_all_samples(study, seen):
     assert {samples for _, samples in seen} == {max(LENGTHS)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("changes", "more"),
     [

@@ -102,6 +102,7 @@ _SPOIL = {
 }
 
 
+@pytest.mark.long
 def test_bad_specimens_cost_only_themselves(tmp_path):
     """27 specimens, 7 of them bad in 7 ways: the other 20 come out as without them."""
     force, _ = synthetic.forces(synthetic.draw(5, 27, 1.3, CLEAR))

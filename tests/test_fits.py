@@ -16,6 +16,8 @@ from jaxtrachea.config import load_fit_spec
 from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.status import FitStatus
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[1]
 VIRTUAL = ROOT / "fits" / "virtual_trachea"
 EXPECTED = json.loads((VIRTUAL / "expected.json").read_text())

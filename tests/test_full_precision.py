@@ -103,6 +103,7 @@ CASES = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("f", CASES)
 def test_products_of_a_value_and_its_gradient(f):
     def total(s):

@@ -18,7 +18,7 @@ from jaxtrachea.fusion import fuse, one_by_one
 
 #: With the first word: XLA makes calls of its own small loops.
 MARK = 'inlineable="false",xla_cpu_small_call="true"'
-pytestmark = [pytest.mark.usefixtures("on_the_cpu"), pytest.mark.compiling]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("on_the_cpu"), pytest.mark.compiling]
 
 
 def part(pair, n):

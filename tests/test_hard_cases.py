@@ -72,6 +72,7 @@ def test_value_and_gradient(name):
     assert all(np.isfinite(v) for v in gradient.values())
 
 
+@pytest.mark.long
 def test_float32_agrees_with_float64():
     one, two = (solved("200 rings", dtype)[0] for dtype in DTYPES)
     np.testing.assert_allclose(one.force, two.force, rtol=2e-5)
@@ -80,6 +81,7 @@ def test_float32_agrees_with_float64():
     np.testing.assert_allclose(one.reactions, two.reactions, atol=3e-5 * peak, rtol=0)
 
 
+@pytest.mark.long
 def test_bad_rows_do_not_touch_their_neighbours():
     """NaN and folded specimens in a batch are flagged; the good ones keep every bit."""
     rows = [{}, {"EI_L": np.nan}, {"s": 40.0}, {"k_3": -1e4}]

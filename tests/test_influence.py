@@ -68,6 +68,7 @@ def test_one_unknown_is_the_textbook(noise):
     assert np.isnan(found.of.curve_left_out).all()  # nothing is known without the only curve
 
 
+@pytest.mark.long
 def test_curves_of_unequal_weight():
     """Weights b^2 = mean length / n: variance of residuals by the whole hat matrix, lost curves."""
     found = influence(fit(linear_study((30, 10)), SHARP))

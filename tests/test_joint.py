@@ -173,6 +173,7 @@ def test_the_step_of_the_trust_region():
     assert damping[0] > 0
 
 
+@pytest.mark.long
 def test_linear_model_is_linear_least_squares(linear):
     value, error = linear_truth(linear.study)
     assert linear.lanes == LANES

@@ -16,6 +16,8 @@ from jaxtrachea.measurements.whole_record import second_half_of_hold
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 K_1, GAMMA, TAU, DEPTH, NOISE = 0.5, (0.9, 0.6), (0.3, 5.0), 2.0, 0.003
 SPEEDS = (0.5, 0.5, 2.0, 8.0)
 ONE = Settings(starts=1, verify=False)

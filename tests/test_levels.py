@@ -70,6 +70,7 @@ def test_parameters_are_declared(word):
         assert all(n in level.declares or DECLARED[n].part == "press" for n in names)
 
 
+@pytest.mark.long
 def test_a_response_has_what_is_observed(word):
     """Each observed field is there, of one shape, and nothing else that can be measured."""
     level = level_of(options_of(word))
@@ -98,6 +99,7 @@ def test_what_a_level_presses_it_admits(word):
     assert level.admits(deep, SIZE, onset=5.0) is None
 
 
+@pytest.mark.long
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     ("options", "changes"),
@@ -163,6 +165,7 @@ def test_a_level_relaxes_around_any_other(options):
         level.response(GEOMETRY, level.material(values), motion)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "options", [*TIMED[:2], pytest.param(TIMED[2], **LATE)], ids=["line", "parts", "sections"]
 )
@@ -255,6 +258,7 @@ def test_a_sample_without_a_solution_has_a_status_and_no_number(word):
     assert (status == PressStatus.OFF_TUBE).all()
 
 
+@pytest.mark.long
 def test_nobody_asks_which_level_it_is():
     """Outside of the mechanics no module of fits or predictions compares the skeleton's word."""
     for room in ("fitting", "prediction", "inference", "results"):

@@ -87,6 +87,7 @@ BOXES = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "batch", "unoptimised"), [(1, 16, False), (1, 16, True), (1000, 64, False)]
 )
@@ -162,6 +163,7 @@ def test_float32_ends_on_the_bound_as_given():
     np.testing.assert_allclose(solved.theta[0, 1], bound**2, rtol=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("residual", "start", "cost", "steps"),
     [(jennrich_sampson, (0.3, 0.4), 124.362, 16), (brown_dennis, (25, 5, -5, -1), 85822.2, 20)],

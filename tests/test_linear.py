@@ -14,6 +14,8 @@ from jaxtrachea._linear import linear, replaced
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.surface import local, regions
 
+pytestmark = pytest.mark.long
+
 #: Most of the time is compilation.
 SLOW = [pytest.mark.slow, pytest.mark.compiling]
 

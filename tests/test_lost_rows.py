@@ -124,6 +124,7 @@ def test_a_displacement_that_is_no_number_says_nothing_of_the_onset():
         np.testing.assert_allclose(found, alone, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_a_place_off_the_beam_says_nothing_of_the_beam():
     """As if it had not been asked for: `contact_compliance` of one and of many, `deflect`."""
 

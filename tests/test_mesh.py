@@ -471,6 +471,7 @@ def test_real_trachea(real):
     assert real.rotation[1, 2] > 0.8
 
 
+@pytest.mark.long
 @needs_real
 def test_real_trachea_from_another_format(real):
     """STL: millimetres, other axes, the rings in a file of their own."""

@@ -50,6 +50,7 @@ def test_ratio_is_the_root_of_chi_squared_over_its_freedom(sigma):
         assert ("errors and intervals have grown" in sentences[0]) == (sigma < SIGMA)
 
 
+@pytest.mark.long
 def test_few_samples_may_do_so_by_chance():
     """One of a thousand fits is told of, not one of ten; see scipy's chi^2 of 3 - 1 samples."""
     rng = np.random.default_rng(1)

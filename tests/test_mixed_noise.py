@@ -53,6 +53,7 @@ def slopes(values):
     return (np.array(v) for v in zip(*rows, strict=True))
 
 
+@pytest.mark.long
 def test_errors_are_of_each_kinds_own_noise():
     """(J_f^T J_f / s^2 + J_m^T J_m / sigma^2)^-1, s from forces alone.
 
@@ -98,6 +99,7 @@ def test_criteria_are_of_the_likelihood_whatever_the_lengths_of_others():
     assert by_itself.criteria.deviance[0] == pytest.approx(-2 * np.sum(logs), rel=1e-6)
 
 
+@pytest.mark.long
 def test_markers_beyond_their_noise_are_told():
     """A cautious sigma is not: it says what the model may miss."""
     for given, told in ((MARKER / 10, True), (MARKER, False), (10 * MARKER, False)):

@@ -133,6 +133,7 @@ def test_axial_share_is_equal_along_each_side():
     np.testing.assert_allclose(np.diff(np.concatenate([[0], d[:6]])), d[0], rtol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rings", ["mat", "arch", "arch2"])
 def test_mirror(rings):
     """The press at -phi, mirrored in z, is the mirrored press: U and V change places."""
@@ -144,6 +145,7 @@ def test_mirror(rings):
     np.testing.assert_allclose(two.end_U, np.asarray(one.end_V) * flip, atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "options", [Options(), Options(coupling="total", shear=True, local="two-material")], ids=repr
 )
@@ -183,6 +185,7 @@ def test_reciprocity_and_ends():
     np.testing.assert_allclose(local_frame(jnp.asarray(0.9)), turned(0.9), atol=1e-15)
 
 
+@pytest.mark.long
 def test_mat_and_arch():
     """`mat`: 1 / k_M both ways, rings as one piece; `arch`: the stiffness along the normal."""
     mat, arch = pressed(rings="mat"), pressed(rings="arch")
@@ -298,6 +301,7 @@ def test_records_of_another_class_are_named():
         wrong.__post_init__()
 
 
+@pytest.mark.long
 def test_unused_effects_are_not_in_the_program():
     """Without stretch, and on the mat, the compiled program has fewer operations."""
     args = table_1(), material(), np.asarray(63.0), np.asarray(0.4), np.asarray(MOVES)
@@ -355,6 +359,7 @@ def test_gradients_at_rest():
         np.testing.assert_allclose(along, (up - down) / (2 * step), atol=close, rtol=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rings", ["mat", "arch", "arch2"])
 def test_numbers_of_python_are_of_the_tubes_type(rings):
     """Level `mat` made numbers of the material float64, which ended in a fault of a loop."""

@@ -19,6 +19,8 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.results.read import read_results
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 TOTAL, WAY, SAMPLES = Options(coupling="total"), 4.0, 60
 TRUTH = {"k_1": 0.1, "k_3": 0.01, "k_5": 0.002}
 K_5 = {"k_5": {"value": 0.001, "lower": 0.0}}

@@ -222,6 +222,7 @@ def own_misfit(curve, k_1, k_3, start):
     return misfit(least_squares(misfit, start, x_scale="jac").x)
 
 
+@pytest.mark.long
 def test_a_curve_left_out_fits_its_own_onset(owned):
     """SciPy: others fitted, then the curve's own two numbers with their k_1 and k_3."""
     left = leave_one_out(owned, ONE)

@@ -486,6 +486,7 @@ def test_misuse_is_told():
         patches_of(surface, np.r_[BORDERS, 200.0, 210.0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("beta", [None, 50.0])
 def test_a_patch_that_is_no_number_is_told(beta):
     """Wherever it is: the broad phase cannot know which patch is nearest."""

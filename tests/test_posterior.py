@@ -32,6 +32,8 @@ from jaxtrachea.report.overview import overview
 from jaxtrachea.results.rows import parameter_rows
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 ONE = Settings(starts=1, verify=False)
 SPEC = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n[uncertainty]\nposterior = 100\n'
 

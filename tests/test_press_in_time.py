@@ -46,6 +46,7 @@ def run(material, relaxes, options, time=TIMES, way=WAY, s_c=22.0):
     return press_in_time(TUBE, material, Motion(s_c, way, time=time), relaxes, options)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "material"),
     [
@@ -72,6 +73,7 @@ def test_parts_that_relax_alike_are_the_uniform_level(change, material):
     assert np.all(way[off] > WAY[off] - 1e-12) or not off[1:].any()
 
 
+@pytest.mark.long
 def test_without_strength_it_is_the_elastic_press():
     none = Branches(jnp.zeros(2), TWO.tau)
     plain = press(TUBE, QUINTIC, 22.0, WAY)
@@ -102,6 +104,7 @@ def parts_by_ode(times, way, rate, c, law, local, skeleton, top):
     return force, way(times) - d
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("softens", [False, True])
 def test_parts_apart_are_those_of_the_differential_equation(softens):
     """Order 2 in the step. Softening multiplies the force of small strain.
@@ -134,6 +137,7 @@ def test_parts_apart_are_those_of_the_differential_equation(softens):
     assert np.all((orders > 1.9) & (orders < 2.1)), orders
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("options", "relaxes"), [(UNIFORM, Relaxation(TWO)),
                                                   (PARTS, Relaxation(TWO, OTHER))])  # fmt: skip
 def test_samples_back_in_time_or_at_no_place_are_as_if_not_there(options, relaxes):
@@ -152,6 +156,7 @@ def test_samples_back_in_time_or_at_no_place_are_as_if_not_there(options, relaxe
     assert np.asarray(found.status)[bad].tolist() == [back, nowhere, back]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("options", "relaxes"), [(UNIFORM, Relaxation(TWO)),
                                                   (PARTS, Relaxation(TWO, OTHER))])  # fmt: skip
 def test_after_a_fold_there_is_no_history(options, relaxes):
@@ -183,6 +188,7 @@ def test_a_branch_that_is_none_is_told():
         assert np.isnan(found.force).all()
 
 
+@pytest.mark.long
 def test_derivatives_through_lift_off():
     """By stiffnesses, branches and displacement, in both modes."""
     way = np.interp(TIMES[::8], [0, 1, 6, 7, 9, 10], [0, 4, 4, 0.2, 0.2, 3])
@@ -201,6 +207,7 @@ def test_derivatives_through_lift_off():
     check_grads(jax.jit(of), given, order=1, rtol=1e-6, atol=1e-6, eps=1e-6)
 
 
+@pytest.mark.long
 def test_many_presses_side_by_side_are_each_as_if_alone():
     rng = np.random.default_rng(1)
     gamma, tau = rng.uniform(0.2, 1, (3, 2)), rng.uniform(0.2, 3, (3, 2))

@@ -231,6 +231,7 @@ def first_row():
         return next(csv.DictReader(stream))
 
 
+@pytest.mark.long
 def test_rows_hold_the_points(curved):
     _, result, found = curved
     rows = list(profile_rows(found))

@@ -135,6 +135,7 @@ def compiled_mean(half, dtype):
     return jax.jit(jax.vmap(jax.value_and_grad(mean), (0, None)), compiler_options=QUICK)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("transition", "atol"), [(0.5, 1e-12), (2.0, 1e-12), (5.0, 1e-12), (8.0, 1e-12), (25.0, 2e-4)]
 )

@@ -160,6 +160,7 @@ def test_a_status_with_a_solution_says_so():
         assert status.solved == (status.message.startswith("solved") or status == 1), status
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_wall_beyond_the_axis_is_told(dtype):
     """The wall moves by what the tool presses beyond first touch: TOO_DEEP past the radius, solved.

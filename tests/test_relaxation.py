@@ -81,6 +81,7 @@ def test_a_sinus_stores_and_loses_as_its_moduli_say():
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 2, atol=0.05)
 
 
+@pytest.mark.long
 def test_lift_off_and_recovery_are_those_of_the_differential_equation():
     """While the tool is off the surface creeps and meets it again: of second order in the step."""
     errors = []
@@ -202,6 +203,7 @@ def test_derivatives_in_both_modes_are_those_of_differences(unilateral):
         assert np.sum(np.asarray(of(*given)[0]) == 0) > 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unilateral", [True, False])
 def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilateral):
     t, elastic, *_ = lanes()
@@ -237,6 +239,7 @@ def test_derivatives_beside_the_value_are_those_of_jax_through_lift_off(unilater
     assert alone[1].elastic is None
 
 
+@pytest.mark.long
 def test_directions_chain_a_law_of_few_numbers_to_its_branches():
     t, elastic = map(jax.device_put, journey(60))
     span, given = Span(0.05, 10.0), np.array([0.7, 0.2])
@@ -254,6 +257,7 @@ def test_directions_chain_a_law_of_few_numbers_to_its_branches():
     np.testing.assert_allclose(np.asarray(force)[1:], np.asarray(expected).T, rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_no_path_gives_more_work_than_was_put_in():
     """Random paths, laws and branches with lift-off; the work is integrated here.
 

@@ -76,6 +76,7 @@ def point_of(study, seed=3):
     return jnp.asarray(guess + 0.2 * np.random.default_rng(seed).normal(size=guess.size))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["line", "parts", *late("fung")])
 def test_residual_is_that_of_the_press_in_time(kind):
     """In closed form beside `press_in_time` in forward mode, through lift-off."""
@@ -108,6 +109,7 @@ def test_residual_is_that_of_the_press_in_time(kind):
     np.testing.assert_allclose(jacobian, slopes, rtol=1e-7, atol=1e-7 * np.abs(slopes).max())
 
 
+@pytest.mark.long
 def test_truth_is_found_again():
     """Of two positions, noise of 0.3 %: strengths and times as they are, none on a bound."""
     table = {n: {"fixed": True, "value": float(getattr(MATERIAL, n))} for n in ("EI_L", "k_M")}

@@ -34,6 +34,7 @@ def estimates(time, displacement, force):
     return dict(zip(names, result.value[0], strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_the_unit_of_time_scales_tau_alone(scale):
     """The first sample is at 0."""
@@ -44,6 +45,7 @@ def test_the_unit_of_time_scales_tau_alone(scale):
     assert found == pytest.approx(expected, rel=1e-3)  # 22 samples in the ramp
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("clock", ["end of the ramp", "start of the ramp"])
 def test_a_hold_fitted_alone_has_the_right_tau_and_a_wrong_gamma(clock):
     """By the factors of the closed form, 0.63 and 1.72 where the ramp lasts as long as tau."""

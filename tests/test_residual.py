@@ -184,6 +184,7 @@ def test_lanes_are_as_each_by_itself():
                     np.testing.assert_allclose(got[k], true, rtol=0, atol=atol)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "loss"),
     [("default", "linear"), pytest.param("bonded", "huber", marks=pytest.mark.slow)],

@@ -99,6 +99,7 @@ def test_page_names_every_dataset(result, tmp_path):
         write_hdf5(tmp_path / "r.h5", AnalysisResults(result), {})
 
 
+@pytest.mark.long
 def test_columns_that_gzip_makes_smaller_are_packed(tmp_path):
     """Displacements in even steps and a sigma that is not there; noise of full precision is not."""
     depth = np.round(np.linspace(0.001, 2, 2000), 3)

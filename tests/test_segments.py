@@ -179,6 +179,7 @@ def test_loadings_of_the_records(records, timed):
         assert wrong <= 3 + 0.04 * record.loading.sum(), record.kind
 
 
+@pytest.mark.long
 def test_k_1_of_the_records(records):
     """Median error of k_1 by least squares: 0.2 % now; 6.6 % with all, 9.7 % with first branches.
 

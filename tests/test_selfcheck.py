@@ -27,6 +27,7 @@ def wrong(outcomes):
     return [o for o in outcomes if not o.passed]
 
 
+@pytest.mark.long
 def test_quick_functions():
     rows = [c for c in CASES if c.function in QUICK]
     assert not wrong(run_table(rows, TRUTHS, table.DTYPES, unoptimised=True))

@@ -115,6 +115,7 @@ class _Silent:
         return self
 
 
+@pytest.mark.long
 def test_every_specimen_has_a_row_and_bad_ones_a_reason(batch):
     ill, _, bad, codes = batch
     rows = table(ill / "summary.csv")

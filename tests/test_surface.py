@@ -494,6 +494,7 @@ def test_dent_of_the_vertices_near_it_is_that_of_all(order, count):
         np.testing.assert_allclose(near, far, rtol=0, atol=scale)
 
 
+@pytest.mark.long
 def test_shares_of_a_way_are_its_targets():
     """Three columns of weights, and one times the way: values and derivatives, near and of all."""
     at, count = jnp.asarray(shuffled(TUBE), "float64"), 16

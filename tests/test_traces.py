@@ -25,6 +25,8 @@ from jaxtrachea.files.lock import take
 from jaxtrachea.files.traces import Traced, keep_traces
 from jaxtrachea.optimisation import programs
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[1]
 #: Names of the functions below each time that one is traced.
 TRACES = []

@@ -32,6 +32,8 @@ from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.load import Load
 from jaxtrachea.tradeoff.trial import Trial
 
+pytestmark = pytest.mark.long
+
 
 def staged(scene=SCENE, **material):
     spec = SceneSpec.model_validate(scene | {"material": scene["material"] | material})

@@ -184,12 +184,14 @@ def changes(browser, act):
     return before, browser.run(FORCE)
 
 
+@pytest.mark.long
 @needs_browser
 def test_the_page_is_there_before_the_scene(browser):
     assert re.match("reading|compiling", browser.first)
     assert browser.run("location.search") == ""  # the token does not stay in the address
 
 
+@pytest.mark.long
 @needs_browser
 def test_a_drag_a_key_and_a_click_change_the_force(browser):
     assert browser.run(FORCE) == "no contact"
@@ -208,12 +210,14 @@ def test_a_drag_a_key_and_a_click_change_the_force(browser):
     assert not browser.errors
 
 
+@pytest.mark.long
 @needs_browser
 def test_the_label_is_that_of_simulate(browser, simulated):
     for at, force in zip(PLACES[:2], simulated["force"], strict=False):
         assert place(browser, at)[0] == f"F {np.linalg.norm(force):.4f} N"
 
 
+@pytest.mark.long
 @needs_browser
 def test_where_there_is_no_force_the_page_says_why_and_keeps_the_surface(browser, simulated):
     assert place(browser, PLACES[2]) == ("no contact", "the tool does not touch")
@@ -226,6 +230,7 @@ def test_where_there_is_no_force_the_page_says_why_and_keeps_the_surface(browser
     assert browser.run("trachea.finite()")
 
 
+@pytest.mark.long
 @needs_browser
 def test_a_slider_changes_the_force_and_compiles_nothing(browser, server):
     shown = browser.run("[...document.querySelectorAll('[id^=value-]')].map((e) => e.id)")
@@ -245,6 +250,7 @@ def test_a_slider_changes_the_force_and_compiles_nothing(browser, server):
     assert server.compiled == before > 0
 
 
+@pytest.mark.long
 @needs_browser
 def test_no_request_leaves_this_machine(browser, server):
     addresses = [a for a in browser.requests if not a.startswith(("data:", "blob:"))]
@@ -253,6 +259,7 @@ def test_no_request_leaves_this_machine(browser, server):
     assert not browser.errors  # nothing broke the Content-Security-Policy
 
 
+@pytest.mark.long
 def test_only_the_page_itself_is_answered(server):
     good = f"/?token={server.token}"
     status, page, heads = server.get(good)
@@ -279,6 +286,7 @@ def test_only_the_page_itself_is_answered(server):
     assert server.get("/_nicegui/3.18.0/static/..%2f..%2fapp.py", Cookie=cookie)[0] == 404
 
 
+@pytest.mark.long
 def test_it_listens_on_loopback_alone(server):
     rows = Path("/proc/net/tcp").read_text().split("\n") if sys.platform == "linux" else []
     found = [r.split()[1] for r in rows[1:] if r and r.split()[3] == "0A"]
@@ -291,6 +299,7 @@ def test_it_listens_on_loopback_alone(server):
 NICEGUI = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", ["/frames", NICEGUI])
 def test_both_sockets_refuse_strangers(server, path):
     with server.socket(path) as link:
@@ -314,6 +323,7 @@ RADIUS = 12.6
 GOOD = [1, 0, 0, 0, 1, 0, 0, 0, 1, 30, 16, 0]
 
 
+@pytest.mark.long
 def test_messages_that_are_none_close_the_socket(server):
     bad = [
         "x" * 2**20, "no JSON", '"other"', "[" * 4000, json.dumps({"pose": GOOD[:11]}),
@@ -331,6 +341,7 @@ def test_messages_that_are_none_close_the_socket(server):
         assert len(link.recv(timeout=60)) > 40
 
 
+@pytest.mark.long
 def test_dragged_about_the_wall_no_row_needs_another_plan(server):
     """5 x 5 x 5: along, round (all the rings) and into the wall."""
     found = []
@@ -351,6 +362,7 @@ def test_dragged_about_the_wall_no_row_needs_another_plan(server):
     assert found.count(PressStatus.OK) >= 75
 
 
+@pytest.mark.long
 @needs_browser
 def test_a_second_page_takes_over_and_the_first_says_so(browser, server):
     with server.socket() as link:
@@ -358,6 +370,7 @@ def test_a_second_page_takes_over_and_the_first_says_so(browser, server):
         browser.wait("/another page/.test(document.querySelector('#status').innerText)")
 
 
+@pytest.mark.long
 @needs_browser
 def test_a_recording_plays_from_disk(browser, server, simulated, tmp_path):
     page = tmp_path / "play.html"
@@ -381,6 +394,7 @@ def test_a_recording_plays_from_disk(browser, server, simulated, tmp_path):
     assert not [a for a in browser.requests if not a.startswith(("file:", "data:", "blob:"))]
 
 
+@pytest.mark.long
 def test_a_recording_of_another_version_is_refused(server, tmp_path):
     file = Path(shutil.copy(server.simulation, tmp_path))
     with h5py.File(file, "r+") as changed:
@@ -392,6 +406,7 @@ def test_a_recording_of_another_version_is_refused(server, tmp_path):
         of_file(file)
 
 
+@pytest.mark.long
 def test_bad_input_ends_the_command(server, scene_file, tmp_path, monkeypatch, capsys):
     taken = run(monkeypatch, capsys, "view", scene_file, "--port", server.port)
     assert taken[0] == 2

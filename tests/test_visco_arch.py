@@ -75,6 +75,7 @@ def errors(found, top, law, local, skeleton):
     return off[LOADING].max(), off[HOLD].max(), unloading[touches].max(), unloading.max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("top", [1.0, 2.0, 3.5])
 def test_parts_that_soften_are_within_a_percent_of_the_arch(top):
     """All of the way is the skeleton's. The bars: 1 % until the end of the hold, 4 % to 2 mm."""
@@ -84,6 +85,7 @@ def test_parts_that_soften_are_within_a_percent_of_the_arch(top):
     assert unloading < (0.04 if top <= 2 else 0.09)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("top", "most"), [(1.0, 0.0085), (2.0, 0.017), (3.5, 0.029)])
 def test_the_elastic_force_relaxed_is_the_worse_the_deeper(top, most):
     """`uniform` of a level without a ratio (`sections`): told in docs/evidence/measured.md."""
@@ -103,6 +105,7 @@ def test_of_a_local_law_that_takes_its_share_parts_are_as_found(local, skeleton,
     assert max(loading, hold) < most
 
 
+@pytest.mark.long
 def test_a_fit_notes_where_uniform_errs_by_more_than_2_percent():
     """As found against the arch, by the depth of the record and whether it has unloading."""
     options = Options(relaxation="uniform", skeleton="softening")

@@ -14,6 +14,8 @@ from jaxtrachea._numerics import epsilon
 from jaxtrachea._written_out import written_out
 from jaxtrachea.fusion import fuse
 
+pytestmark = pytest.mark.long
+
 #: Products as `einsum` names them, and the sizes of the two.
 PRODUCTS = {
     "i,i->": ((5,), (5,)),

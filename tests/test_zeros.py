@@ -183,6 +183,7 @@ def fitted():
     return fit(study, Settings(starts=2, more_starts=0))
 
 
+@pytest.mark.long
 @pytest.mark.compiling
 def test_fit_of_a_mixed_study(fitted):
     """Truth within three standard errors; the first curve's residual knows no onset."""
@@ -214,6 +215,7 @@ def test_predictions_of_a_mixed_fit(fitted):
     assert np.std(only.residual) < 1.5 * SIGMA
 
 
+@pytest.mark.long
 @pytest.mark.compiling
 def test_a_line_is_fitted_with_its_error():
     """-0.1 N/mm below a press from 1 mm of air on; the line's error is that of the air or less."""

@@ -24,6 +24,8 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.measurements.curve import Curve
 
+pytestmark = pytest.mark.long
+
 #: Strength and time, s, of the two branches; N/mm in the long run.
 GAMMA, TAU, STIFF = (0.9, 0.5), (0.4, 4.0), 0.3
 NOISE = 0.002

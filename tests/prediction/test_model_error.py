@@ -18,6 +18,8 @@ from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.status import PredictionStatus
 
+pytestmark = pytest.mark.long
+
 VIRTUAL = Path(__file__).parents[2] / "fits" / "virtual_trachea"
 
 

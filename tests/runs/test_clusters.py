@@ -56,6 +56,7 @@ def test_a_worker_with_other_versions_fits_nothing():
         cluster_runs.refuse_other(here | {"jax": "0.1"})
 
 
+@pytest.mark.long
 def test_a_cluster_that_is_not_there(study, monkeypatch, capsys):
     pytest.importorskip("distributed")
     monkeypatch.setattr("jaxtrachea.runs.cluster.PATIENCE", 0.5)

@@ -100,6 +100,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.long
 def test_refusals(peace, study, monkeypatch, capsys):
     """Unfinished and finished runs of something else; nothing is touched, one line says why."""
 
@@ -194,6 +195,7 @@ def test_force_goes_on_and_says_so(study, monkeypatch, capsys):
     assert made["run"]["forced"] == ["curves.csv has changed"]
 
 
+@pytest.mark.long
 def test_failed_lanes_are_fitted_again(peace, study, monkeypatch, capsys):
     """Lanes 1 and 5 are made to fail; the rerun gives them an estimate and touches no other bit."""
     shutil.copytree(peace / "out", study / "out")

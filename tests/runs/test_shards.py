@@ -23,6 +23,7 @@ from jaxtrachea.runs import checkpoint, rerun, shards
 from jaxtrachea.runs import folder as run_folder
 
 
+@pytest.mark.long
 def test_results_are_read_back_bit_for_bit(peace, tmp_path):
     """What write_hdf5 and save wrote comes back; damaged, foreign and truncated shards do not."""
     study = load_peace(peace)
@@ -154,6 +155,7 @@ def test_ctrl_c_ends_all_threads_and_waits_for_them():
     assert sorted(ended) == [0, 1, 2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("threads", [1, 3])
 def test_any_number_of_threads_gives_the_same_bits(threads, peace, study, monkeypatch, capsys):
     seen, real = set(), fit.fit

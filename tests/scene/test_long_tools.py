@@ -75,6 +75,7 @@ def test_shafts_in_all_directions_are_solved():
     np.testing.assert_allclose(found.gap, gap[fair], atol=0.12)
 
 
+@pytest.mark.long
 def test_a_tool_of_a_plan_of_few_steps_may_change():
     """A tolerance leaves steps out; only a longer tool needs more than the one before."""
     scene, _ = scene_of(sphere(5.0), 5.0)

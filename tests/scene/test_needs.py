@@ -15,6 +15,8 @@ from jaxtrachea.scene.refusals import refuse
 from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
 
+pytestmark = pytest.mark.long
+
 OK, NO, OFF_PLAN = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.OFF_PLAN
 ONE = dataclasses.replace(BARE, want_joints=False, want_ring_ends=False)
 #: Along the tube it gives, or not.

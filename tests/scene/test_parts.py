@@ -14,7 +14,8 @@ from jaxtrachea.contact.shapes import Shape, compound, sphere
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.stage import Tool, touch_tube
 
-pytestmark = pytest.mark.compiling
+pytestmark = [pytest.mark.long, pytest.mark.compiling]
+
 
 RUBBED = dataclasses.replace(
     BARE, contact_point="fixed", friction="on", axial="on", second_plane="on", want_joints=False,

@@ -19,6 +19,8 @@ from jaxtrachea.scene.surface_plot import draw_rest, draw_surface
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.mesh import volume
 
+pytestmark = pytest.mark.long
+
 CONFIGS = pathlib.Path(__file__).parents[2] / "configs"
 R, H = 5.0, 10.0
 SOLIDS = {

@@ -250,6 +250,7 @@ def test_rows_that_do_not_press_are_no_contact_wherever_they_are():
         assert height < 14 or (np.asarray(out.force) == 0).all()
 
 
+@pytest.mark.long
 def test_force_is_continuous_across_the_midline():
     """With EI_C and k_t: 0.351 N up to 5e-5 rad, 0.256 N from 1e-4 rad on.
 

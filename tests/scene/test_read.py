@@ -12,6 +12,8 @@ import jaxtrachea as jt
 from jaxtrachea.scene.read import SimulationFileError
 from jaxtrachea.scene.results import plan_rows, write_simulation
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):

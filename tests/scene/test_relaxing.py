@@ -82,6 +82,7 @@ def started(held):
     return start, *run(start, *way)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("relaxation", [TWO, APART])
 def test_a_path_is_a_press_in_time(relaxation):
     material = dataclasses.replace(SPRINGS, k_5=jnp.array(1e-3))
@@ -177,6 +178,7 @@ def test_numbers_that_are_none():
         assert np.isnan(np.asarray(found.force[:, 1])).all()
 
 
+@pytest.mark.long
 def test_steps_are_the_path(held, started):
     """To rounding while the tool holds its place; after it has left the tube it touches anew."""
     scene, material, _, _, path = held
@@ -209,6 +211,7 @@ def test_a_session_is_the_scan():
     assert np.array_equal(again.step(*given).force, session.step(*given).force)
 
 
+@pytest.mark.long
 def test_a_state_is_saved_and_time_does_not_run_back(held, started):
     _, _, run, way, _ = held
     _, end, _ = started

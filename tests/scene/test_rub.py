@@ -15,7 +15,8 @@ from jaxtrachea.scene.facts import SceneFacts
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.stage import Tool
 
-pytestmark = pytest.mark.compiling
+pytestmark = [pytest.mark.long, pytest.mark.compiling]
+
 
 EYE, MU = np.eye(3), 0.66
 RUBBED = dataclasses.replace(

@@ -69,6 +69,7 @@ def test_a_small_tube_is_pressed_as_a_large_one():
     np.testing.assert_allclose(small.vertices / SMALL, one.vertices, rtol=0, atol=1e-6)
 
 
+@pytest.mark.long
 def test_table_1_has_its_own_lengths():
     """Those that every size had before."""
     scene = make_scene(TUBE, SPRINGS, poses([75, 19, 0], [75, 17, 0]), tool=BALL,
@@ -114,6 +115,7 @@ def test_a_mouse_has_a_tube():
     assert float(smooth.scene.tube.filled.max()) < 1e-3
 
 
+@pytest.mark.long
 def test_a_wall_that_a_tool_would_not_touch_is_refused():
     """As that of an imported mesh, also from Python: rows were OK."""
     says = (

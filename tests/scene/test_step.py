@@ -18,7 +18,8 @@ from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.scene import step as stepping
 from jaxtrachea.scene.stage import Tool
 
-pytestmark = pytest.mark.compiling
+pytestmark = [pytest.mark.long, pytest.mark.compiling]
+
 
 EYE = np.eye(3)
 HELD = dataclasses.replace(

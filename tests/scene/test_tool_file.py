@@ -138,6 +138,7 @@ SCENE = {
 }
 
 
+@pytest.mark.long
 def test_a_scene_takes_it(tmp_path):
     trimesh.creation.box(BOX).export(tmp_path / "probe.stl")
     tool = {"shape": "mesh", "file": "probe.stl"}
@@ -162,6 +163,7 @@ def test_a_bad_key_is_named(tool, says, tmp_path):
         stage(spec, tmp_path)
 
 
+@pytest.mark.long
 def test_parts_stand_where_the_scene_says(tmp_path):
     """A ball and a box from a file, turned by 90 degrees about x: its z is the tool's -y."""
     trimesh.creation.box(BOX).export(tmp_path / "probe.stl")

@@ -65,6 +65,7 @@ def ways(*paths):
     return np.stack([np.append(v, [v[-1]] * (rows - len(v))) for v in columns], axis=1)
 
 
+@pytest.mark.long
 def test_forces_are_those_of_press_contacts():
     out, D = pressed(), ways(LEFT, RIGHT)
     found = press_contacts(TUBE, SPRINGS, [70.0, NEXT], D)
@@ -76,6 +77,7 @@ def test_forces_are_those_of_press_contacts():
     np.testing.assert_allclose(-out.depth[:, :, 1], np.maximum(found.depth, 0), atol=1e-15)
 
 
+@pytest.mark.long
 def test_surface_passes_through_every_contact():
     """The vertex at a contact moves as the tool does, to the last digits; the far ones do not."""
     out, D = pressed(), ways(LEFT, RIGHT)
@@ -122,6 +124,7 @@ def test_apart_every_force_is_that_of_its_tool_alone():
         np.testing.assert_allclose(-out.force[:, j, 1], alone, rtol=0, atol=2e-4)
 
 
+@pytest.mark.long
 def test_a_row_in_which_one_is_refused_has_no_numbers():
     D = np.zeros((3, 3))
     D[:, 1] = [-1, np.nan, -1]

@@ -76,6 +76,7 @@ def test_the_scale_has_the_derivatives_of_finite_differences():
     assert slope[2] == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "dtype"), [("ball", "f4"), ("capsule", float)])
 def test_a_dent_is_scaled_until_it_touches(name, dtype):
     """A plane with a dent 0.7 mm deep; the tool reaches below it, less, or not to the plane."""

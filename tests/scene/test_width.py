@@ -75,6 +75,7 @@ def by_elements(s, at=(), GA=None):
 PLACES = [HALF, 22.0, 30.0, 71.7, 75.0, 160 - HALF]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["linear", "softening"])
 def test_rows_are_those_of_press(kind):
     """At both ends of the tube, on a ring, with an edge beside one and between two; to rounding."""
@@ -342,6 +343,7 @@ def test_the_rule():
         EffectOptions(half_width=-1.0)
 
 
+@pytest.mark.long
 def test_a_width_that_neither_tube_nor_tool_has():
     with pytest.raises(SizeError, match="half_width is 80.5 mm; expected at most 80 mm, half the"):
         make_scene(TUBE, STIFF, down([1.0]), effects=dataclasses.replace(BARE, half_width=80.5))

@@ -253,7 +253,7 @@ def test_an_equilibrium_that_is_no_minimum_is_seen():
         return parts, solve_path(parts, path).state
 
     parts, states = pressed(jnp.asarray([3.0, 10.9, 11.0]))
-    slope = float(states.force[2, 0] - states.force[1, 0]) / 0.1
+    slope = float(states.force[2, 0, 0] - states.force[1, 0, 0]) / 0.1
     assert slope < -1e-3
     excess = jax.jit(lambda state, parts: system.excess_negative(
         system.linearise(state, jnp.asarray(0.0), parts)[1]))  # fmt: skip
@@ -295,6 +295,7 @@ def test_accepted_states_are_equilibria():
     assert np.max(change / np.abs(paths)) <= 1e-12
 
 
+@pytest.mark.long
 def test_refusals():
     nan = np.where(np.arange(9) == 4, np.nan, PATH)
     cases = {
