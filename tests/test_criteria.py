@@ -37,6 +37,8 @@ from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
+pytestmark = pytest.mark.long
+
 DEPTH = np.linspace(0.1, 3.0, 20)
 SIGMA = 0.05
 TOTAL = Options(coupling="total", onset_width=0.0, contact="bonded")

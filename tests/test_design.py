@@ -31,6 +31,8 @@ from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.status import FitStatus
 
+pytestmark = pytest.mark.long
+
 #: No one reads verdicts here.
 ONE = Settings(starts=1, verify=False)
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
@@ -124,7 +126,6 @@ def test_criteria_are_their_definitions_and_greedy_takes_the_best(known):
     assert candidates.depth[next_points(known, candidates).chosen[0]] == 6.0
 
 
-@pytest.mark.long
 def test_map_knows_that_one_place_is_not_enough(known):
     """The same place twice leaves EI_L and k_M apart by rounding only; two places do not."""
     s = np.linspace(15.0, 145.0, 27)
@@ -204,7 +205,6 @@ def test_expected_errors_are_those_of_the_refit():
     np.testing.assert_allclose(choice.error[1], again.relative_se[0], rtol=1e-3)
 
 
-@pytest.mark.long
 def test_errors_before_any_press_are_those_of_the_fit():
     """Where the noise is estimated."""
     study = unequal_study(np.log(CLEAR), noise=np.random.default_rng(5))

@@ -35,6 +35,8 @@ from jaxtrachea.report.plots import STYLE, _draw_bands, _scale, draw_residuals, 
 from jaxtrachea.report.shown import Shown
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 SIGMA = 2e-3
 DEPTH = np.linspace(0.1, 2, 12)
 BONDED = Options(coupling="total", contact="bonded", onset_width=0.0)
@@ -111,7 +113,6 @@ def test_errors_of_a_linear_fit_are_those_of_its_hat_matrix(one):
     np.testing.assert_allclose(student, r / (s * np.sqrt(1 - h)), rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.long
 def test_errors_are_those_of_influence_by_other_derivatives(many):
     """Of lanes in any order, with sigma estimated."""
     lanes = np.array([9, 2, 2])
@@ -122,7 +123,6 @@ def test_errors_are_those_of_influence_by_other_derivatives(many):
     np.testing.assert_allclose(share, of.leverage[lanes], atol=1e-8)
 
 
-@pytest.mark.long
 def test_errors_with_markers_and_scaled_unknowns(dense_result):
     """Of a skeleton, unknowns on a logarithmic scale, some of single trials."""
     found, n = fitted_errors(dense_result, np.array([0])), dense_result.study.lanes.force.shape[-1]
@@ -161,7 +161,6 @@ def test_panels_are_positions_of_few_fits_and_fits_of_many(one, many):
     assert len(colours) == 2
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("name", ["one", "many", "dense_result"])
 def test_nothing_overlaps_and_every_axis_has_a_unit(name, request):
     result = request.getfixturevalue(name)

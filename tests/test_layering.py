@@ -354,6 +354,7 @@ LOADS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "names",
     [

@@ -12,6 +12,8 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 SIGMA, D = 0.003, np.linspace(0.1, 2, 60)
 QUICK = Settings(starts=1, verify=False)
 
@@ -50,7 +52,6 @@ def test_ratio_is_the_root_of_chi_squared_over_its_freedom(sigma):
         assert ("errors and intervals have grown" in sentences[0]) == (sigma < SIGMA)
 
 
-@pytest.mark.long
 def test_few_samples_may_do_so_by_chance():
     """One of a thousand fits is told of, not one of ten; see scipy's chi^2 of 3 - 1 samples."""
     rng = np.random.default_rng(1)

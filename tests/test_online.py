@@ -15,6 +15,8 @@ from jaxtrachea.inference.design.choice import next_points
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.status import FitStatus
 
+pytestmark = pytest.mark.long
+
 TRUTH = np.array([300.0, 1.0, 0.5, 0.2])
 S = np.array([22.0, 75.0, 80.0, 45.0])
 SIGMA, DEPTH = 0.05, 6.0
@@ -52,7 +54,6 @@ def run():
     return one, states, settled, jt.fit(one.study(), ONE)
 
 
-@pytest.mark.long
 def test_settled_it_is_the_fit_of_the_same_samples(run):
     _, states, settled, result = run
     assert settled.status == FitStatus.CONVERGED == result.status[0]
@@ -129,7 +130,6 @@ def test_the_next_place_is_that_of_a_design(run):
     assert online(candidates=[60.0]).state.next_point == 60.0
 
 
-@pytest.mark.long
 def test_a_sample_compiles_nothing_and_many_take_room(run):
     """Nine presses of arrays, one of them of 2,300 samples: more than any first room."""
     s = np.append(S, [30.0, 60.0, 100.0, 115.0, 140.0])

@@ -177,6 +177,7 @@ def test_bounds_are_bounds():
     assert np.median((gap - bounds)[outside]) < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("height", [0.0, 5.0])
 def test_continuous_across_borders(height):
     """Gap, s, phi and normal along a path that crosses a border, in steps of 1 and 25 um."""
@@ -276,6 +277,7 @@ def bent(relief: float, flatten: float) -> tuple[trimesh.Trimesh, Patches]:
     return trimesh.Trimesh(vertices, np.asarray(m.faces), process=False), p
 
 
+@pytest.mark.long
 def test_skeleton_coordinates_on_an_arc():
     s, phi, away, _, _ = places(LANES, low=1, high=40)
     point, _, _ = on_arc(s, phi, away)

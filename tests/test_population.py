@@ -18,6 +18,8 @@ from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 
 def draw(rng, m, tau, middle):
     """Truths, estimates and their covariances, of unequal size and correlated."""

@@ -29,6 +29,8 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 ONE = Settings(starts=1, verify=False)
 PAGES = Path(__file__).parents[1] / "docs"
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
@@ -231,7 +233,6 @@ def first_row():
         return next(csv.DictReader(stream))
 
 
-@pytest.mark.long
 def test_rows_hold_the_points(curved):
     _, result, found = curved
     rows = list(profile_rows(found))

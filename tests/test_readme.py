@@ -29,6 +29,7 @@ def test_two_commands_install_and_the_second_is_what_ci_runs():
     assert install[1] in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
+@pytest.mark.long
 def test_fit_from_python_runs_and_finds_what_the_source_states(tmp_path):
     """Ten lines at most; the force at 75 mm is near the finite-element specimen's there."""
     code = blocks("python")[0]

@@ -19,6 +19,8 @@ from jaxtrachea.relaxation.steps import Branches
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
+pytestmark = pytest.mark.long
+
 TUBE = Geometry.create(60.0, [15.0, 30.0, 45.0], radius=visco_arch.RADIUS)
 #: Loading of 1 s, a hold of 10 s, unloading of 1 s.
 TIMES = np.r_[np.linspace(0, 1, 41), np.geomspace(1.025, 11, 50), np.linspace(11.05, 12, 20)]
@@ -75,7 +77,6 @@ def errors(found, top, law, local, skeleton):
     return off[LOADING].max(), off[HOLD].max(), unloading[touches].max(), unloading.max()
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("top", [1.0, 2.0, 3.5])
 def test_parts_that_soften_are_within_a_percent_of_the_arch(top):
     """All of the way is the skeleton's. The bars: 1 % until the end of the hold, 4 % to 2 mm."""
@@ -85,7 +86,6 @@ def test_parts_that_soften_are_within_a_percent_of_the_arch(top):
     assert unloading < (0.04 if top <= 2 else 0.09)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("top", "most"), [(1.0, 0.0085), (2.0, 0.017), (3.5, 0.029)])
 def test_the_elastic_force_relaxed_is_the_worse_the_deeper(top, most):
     """`uniform` of a level without a ratio (`sections`): told in docs/evidence/measured.md."""
@@ -105,7 +105,6 @@ def test_of_a_local_law_that_takes_its_share_parts_are_as_found(local, skeleton,
     assert max(loading, hold) < most
 
 
-@pytest.mark.long
 def test_a_fit_notes_where_uniform_errs_by_more_than_2_percent():
     """As found against the arch, by the depth of the record and whether it has unloading."""
     options = Options(relaxation="uniform", skeleton="softening")

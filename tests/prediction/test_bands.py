@@ -28,6 +28,8 @@ from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.status import PredictionStatus
 from jaxtrachea.trachea.geometry import table_1
 
+pytestmark = pytest.mark.long
+
 VIRTUAL = Path(__file__).parents[2] / "fits" / "virtual_trachea"
 
 

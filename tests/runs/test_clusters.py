@@ -19,6 +19,8 @@ from jaxtrachea.runs import cluster as cluster_runs
 from jaxtrachea.runs import folder as run_folder
 from jaxtrachea.runs import rerun, shards
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def cluster(tmp_path, monkeypatch):
@@ -56,7 +58,6 @@ def test_a_worker_with_other_versions_fits_nothing():
         cluster_runs.refuse_other(here | {"jax": "0.1"})
 
 
-@pytest.mark.long
 def test_a_cluster_that_is_not_there(study, monkeypatch, capsys):
     pytest.importorskip("distributed")
     monkeypatch.setattr("jaxtrachea.runs.cluster.PATIENCE", 0.5)

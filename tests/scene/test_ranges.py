@@ -37,7 +37,7 @@ from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
-pytestmark = pytest.mark.compiling
+pytestmark = [pytest.mark.long, pytest.mark.compiling]
 
 run = jax.jit(simulate)
 OK, OFF_PLAN = PressStatus.OK, PressStatus.OFF_PLAN
@@ -250,7 +250,6 @@ def test_rows_that_do_not_press_are_no_contact_wherever_they_are():
         assert height < 14 or (np.asarray(out.force) == 0).all()
 
 
-@pytest.mark.long
 def test_force_is_continuous_across_the_midline():
     """With EI_C and k_t: 0.351 N up to 5e-5 rad, 0.256 N from 1e-4 rad on.
 

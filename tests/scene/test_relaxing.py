@@ -16,7 +16,7 @@ from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.status import PressStatus
 
-pytestmark = pytest.mark.compiling
+pytestmark = [pytest.mark.long, pytest.mark.compiling]
 
 TWO = jt.Relaxation(jt.Branches(jnp.array([0.9, 0.5]), jnp.array([0.37, 4.3])))
 APART = jt.Relaxation(TWO.local, jt.Branches(jnp.array([0.4]), jnp.array([1.5])))
@@ -82,7 +82,6 @@ def started(held):
     return start, *run(start, *way)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("relaxation", [TWO, APART])
 def test_a_path_is_a_press_in_time(relaxation):
     material = dataclasses.replace(SPRINGS, k_5=jnp.array(1e-3))
@@ -178,7 +177,6 @@ def test_numbers_that_are_none():
         assert np.isnan(np.asarray(found.force[:, 1])).all()
 
 
-@pytest.mark.long
 def test_steps_are_the_path(held, started):
     """To rounding while the tool holds its place; after it has left the tube it touches anew."""
     scene, material, _, _, path = held
@@ -211,7 +209,6 @@ def test_a_session_is_the_scan():
     assert np.array_equal(again.step(*given).force, session.step(*given).force)
 
 
-@pytest.mark.long
 def test_a_state_is_saved_and_time_does_not_run_back(held, started):
     _, _, run, way, _ = held
     _, end, _ = started

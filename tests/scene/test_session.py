@@ -30,7 +30,7 @@ from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import yielded
 from jaxtrachea.status import PressStatus
 
-pytestmark = pytest.mark.compiling
+pytestmark = [pytest.mark.long, pytest.mark.compiling]
 
 EYE = np.eye(3)
 OK, NO_CONTACT, NON_FINITE = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.NON_FINITE
@@ -158,7 +158,6 @@ def check_jumps(force, gap, lengths):
     assert (jump <= stiffness * (lengths + 1e-4)).all(), (jump / lengths).max()
 
 
-@pytest.mark.long
 def test_float32_and_states_by_status(held):
     held.reset()
     step = held.step(EYE, [163, OUTER + 3, 0])
@@ -232,7 +231,6 @@ def test_a_jump_grasps_anew(held):
     np.testing.assert_allclose(s[-1], 95, atol=0.01)
 
 
-@pytest.mark.long
 def test_a_fresh_seat_is_pressed_straight_in(held):
     """After a jump round the tube as well: the force of a single press there."""
     single = jax.jit(partial(press_oblique, TUBE, MATERIAL))

@@ -43,7 +43,7 @@ from jaxtrachea.tradeoff.ladders import ladders
 from jaxtrachea.tradeoff.levels import Full, full_scene, program
 from jaxtrachea.tradeoff.trial import samples
 
-pytestmark = pytest.mark.compiling
+pytestmark = [pytest.mark.long, pytest.mark.compiling]
 
 ROOT = Path(__file__).resolve().parents[2]
 HALF = 2.4
@@ -75,7 +75,6 @@ def by_elements(s, at=(), GA=None):
 PLACES = [HALF, 22.0, 30.0, 71.7, 75.0, 160 - HALF]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("kind", ["linear", "softening"])
 def test_rows_are_those_of_press(kind):
     """At both ends of the tube, on a ring, with an edge beside one and between two; to rounding."""
@@ -343,7 +342,6 @@ def test_the_rule():
         EffectOptions(half_width=-1.0)
 
 
-@pytest.mark.long
 def test_a_width_that_neither_tube_nor_tool_has():
     with pytest.raises(SizeError, match="half_width is 80.5 mm; expected at most 80 mm, half the"):
         make_scene(TUBE, STIFF, down([1.0]), effects=dataclasses.replace(BARE, half_width=80.5))
