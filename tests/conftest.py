@@ -121,7 +121,7 @@ def pytest_runtest_setup(item):
         pytest.skip(f"no time is left for {item.nodeid}")
 
 
-#: Files that take longest begin, so that none runs on alone at the end.
+#: Files that take longest begin, so that none runs on alone at the end; default and long tests.
 LONGEST = (
     "test_view.py",
     "test_press_in_time.py",
@@ -134,15 +134,21 @@ LONGEST = (
     "test_step.py",
     "test_session.py",
     "test_rub.py",
+    "test_online.py",
     "test_fit.py",
     "test_mesh.py",
+    "test_layering.py",
+    "test_contacts.py",
+    "test_beam.py",
+    "test_study.py",
+    "test_cli.py",
     "test_tool_file.py",
     "test_relaxing_fit.py",
     "test_relaxation.py",
+    "test_profile.py",
     "test_fit_pictures.py",
     "test_levels.py",
     "test_patches.py",
-    "test_layering.py",
     "test_oblique.py",
     "test_design.py",
     "test_width.py",

@@ -7,7 +7,7 @@ once, what stands there instead, and the tests that a developer would expect to 
 copied to a temporary folder. All these tests must pass there first. Then each fault is made alone,
 its tests are run, and it is taken back: `caught` if a test fails, `survived` if all pass. NAME:
 these rows only, all without one. `--list`: no test is run, the rows are held against the sources.
-`--slow`: slow tests count, too. Results go to tests/bench/results/mutations.jsonl, the last line of
+Long tests count, `--slow`: slow ones, too. Results go to tests/bench/results/mutations.jsonl, the last line of
 a name is the one that counts. The exit code is 1 where a fault survived. All rows take some 20
 minutes of one core.
 """
@@ -248,7 +248,7 @@ def outcome(folder: Path, tests: list[str], slow: bool) -> str:
     env = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     env["XLA_FLAGS"] = flags()
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
-    words += ["-m", "slow or not slow"] if slow else []
+    words += ["-m", "slow or not slow" if slow else "not slow"]
     words += [f"tests/{name}" for name in dict.fromkeys(tests)]
     done = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True)
     if done.returncode not in (0, 1):
