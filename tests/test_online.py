@@ -34,6 +34,11 @@ def measured(s=S, truth=TRUTH, seed=0):
     return force + SIGMA * np.random.default_rng(seed).normal(size=force.shape)
 
 
+def intervals(result):
+    found = [assess(result, 0, i) for i in range(4)]
+    return [[a.low for a in found], [a.high for a in found]]
+
+
 def pressed(one, force, s=S, displacement=synthetic.DEPTHS):
     """Sample by sample; all states."""
     states = []
@@ -64,6 +69,7 @@ def test_settled_it_is_the_fit_of_the_same_samples(run):
         settled.standard_error, [a.standard_error for a in of_fit], rtol=1e-6
     )
     np.testing.assert_allclose(settled.relative_error, [a.relative_se for a in of_fit], rtol=1e-6)
+    np.testing.assert_allclose([settled.low, settled.high], intervals(result), rtol=1e-6)
     # The last sample had left little to settle: a hundredth of a standard error.
     last = (states[-1].value - settled.value) / settled.standard_error
     assert np.max(np.abs(last)) < 0.03
@@ -106,6 +112,7 @@ def test_what_one_position_leaves_open_is_said_until_there_is_another(run):
     assert first.status == FitStatus.UNIDENTIFIABLE
     assert first.verdict[:2] == ("structurally non-identifiable",) * 2
     assert np.isnan(first.standard_error[:2]).all()
+    assert (first.low[1], first.high[1]) == pytest.approx((1e-6, 1e6))  # its bounds
     assert np.isfinite(first.standard_error[2:]).all()
     assert np.isfinite(second.standard_error).all()
     # So few positions may have another skeleton that fits as well: nothing is promised.
@@ -164,6 +171,7 @@ def test_on_a_bound():
     assert settled.value[3] == pytest.approx(1e-3)
     assert settled.status == FitStatus.AT_BOUND == result.status[0]
     np.testing.assert_allclose(settled.value, result.value[0], rtol=1e-6)
+    np.testing.assert_allclose([settled.low, settled.high], intervals(result), rtol=1e-6)
 
 
 def test_a_record_with_a_zero_of_its_own_is_named():
