@@ -14,6 +14,7 @@ from jaxtrachea.inference.design.candidates import Candidates
 from jaxtrachea.inference.design.choice import next_points
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.status import FitStatus
+from jaxtrachea.viewer.stream import Experiment, Stream
 
 TRUTH = np.array([300.0, 1.0, 0.5, 0.2])
 S = np.array([22.0, 75.0, 80.0, 45.0])
@@ -158,6 +159,33 @@ def test_a_sample_compiles_nothing_and_many_take_room(run):
         whole.press(at)
         whole.add(synthetic.DEPTHS, row)
     np.testing.assert_allclose(whole.settle().value, several.settle().value, rtol=1e-8)
+
+
+def test_the_stream_of_a_page_takes_every_sample_once(run):
+    """In any order it ends where the fit of the samples does; a fault leaves its press out."""
+    one, _, settled, _ = run
+    stream = Stream("fit.toml", lambda _: Experiment(online(), one.curves, {}))
+    stream.pace(1e9)
+    stream.choose(True)
+    stream.play(True)
+    first = online().state.next_point
+    stream.run()
+    assert (stream.state.phase, stream.fault, stream.done) == ("ready", "", True)
+    assert len(stream.states) == 200 + 1
+    assert [n for n, _ in stream.presses] == [0, 50, 100, 150]
+    assert stream.presses[0][1].s_c == min(S, key=lambda s: abs(s - first))
+    np.testing.assert_allclose(stream.states[-1].value, settled.value, rtol=1e-6)
+
+    deep = dataclasses.replace(one.curves[0], displacement=100 + one.curves[0].displacement)
+    stream = Stream("fit.toml", lambda _: Experiment(online(), [deep, one.curves[1]], {}))
+    made = stream.prepare()
+    for taken in (0, 1, 2):  # the fault, then two samples
+        stream.step()
+        assert stream.answer(made)
+        assert len(stream.states) == taken
+    assert stream.fault.startswith("1: displacement is 100.1 mm; expected at most the radius")
+    stream.end()
+    assert not stream.answer(made)
 
 
 def test_on_a_bound():

@@ -224,7 +224,7 @@ class Online:
         side = np.where(open_[0], np.inf, side) if status.succeeded else np.nan
         theta, lower, upper = minimum.theta, study.lanes.lower[0], study.lanes.upper[0]
         ends = np.array([np.maximum(theta - side, lower), theta, np.minimum(theta + side, upper)])
-        low, value, high = np.where(log, np.exp(ends), ends * step)
+        low, value, high = np.where(log, np.exp(np.where(log, ends, 0)), ends * step)
         return OnlineState(
             names=tuple(p.name for p, _, _ in study.unknowns[0]), value=value,
             standard_error=se * np.where(log, value, step), low=low, high=high,

@@ -4,30 +4,22 @@ What is slow to import is imported by the thread: the page is up before.
 """
 
 import dataclasses
-import threading
 import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxtrachea.viewer.frame import Frame
+from jaxtrachea.viewer.worker import Worker
 
-Phase = Literal["reading", "compiling", "ready", "failed"]
 #: Steps that the curve keeps, and bytes of frames that a recording keeps.
 MOST_STEPS, MOST_BYTES = 20_000, 2**28
 
 
-class State(NamedTuple):
-    """Where the work stands; `text` says it to the user."""
-
-    phase: Phase
-    text: str
-
-
-class Live:
+class Live(Worker):
     """A scene under a hand.
 
     The thread reads and compiles, then answers poses and values one after the other. A pose that
@@ -35,9 +27,6 @@ class Live:
 
     Attributes:
         path: of the scene file.
-        changed: called by the thread when there is a new frame or state.
-        state: where the work stands.
-        fault: the last error of a step; empty: none.
         handled: the scene, once it is read.
         sliders: of its parameters, likewise.
         packet: the scene as bytes, likewise.
@@ -53,9 +42,8 @@ class Live:
             path: of the scene file.
             set_up: called by the thread before it reads.
         """
+        super().__init__(path.name)
         self.path, self.set_up = path, set_up
-        self.changed: Callable[[], None] = lambda: None
-        self.state, self.fault = State("reading", f"reading {path.name}"), ""
         self.handled: Any = None
         self.sliders: list[Any] = []
         self.packet = b""
@@ -65,26 +53,7 @@ class Live:
         self._values: dict[str, float] = {}
         self._pose: np.ndarray | None = None
         self._last: np.ndarray | None = None
-        self._reset = self._ended = False
-        self._wake = threading.Condition()
-
-    def start(self) -> None:
-        """Begin in a thread of its own."""
-        threading.Thread(target=self.run, name="session", daemon=True).start()
-
-    def run(self) -> None:
-        """Read, compile, and answer until `end`; what fails is told in `state`."""
-        try:
-            session = self._prepare()
-        except (ValueError, OSError) as error:
-            self._tell("failed", str(error))
-            return
-        except Exception as error:  # of the program: the page says it, the terminal shows where
-            traceback.print_exc()
-            self._tell("failed", f"{type(error).__name__}: {error}; the terminal shows where")
-            return
-        while self._answer(session):
-            pass
+        self._reset = False
 
     def move(self, pose: np.ndarray) -> None:
         """Move the tool: rotation by rows, then translation, mm; shape (12,)."""
@@ -107,12 +76,6 @@ class Live:
             self._pose = self.start_pose
             self._wake.notify()
 
-    def end(self) -> None:
-        """End the thread after its step."""
-        with self._wake:
-            self._ended = True
-            self._wake.notify()
-
     @property
     def start_pose(self) -> np.ndarray:
         """Of the tool at the start; shape (12,)."""
@@ -124,32 +87,27 @@ class Live:
         """Of all sliders, as they are now."""
         return {s.name: s.value for s in self.sliders} | self._values
 
-    def _prepare(self) -> Any:
+    def prepare(self) -> Any:
         """The session."""
         self.set_up()
         from jaxtrachea.viewer.protocol import scene_packet
         from jaxtrachea.viewer.scene import read_handled
         from jaxtrachea.viewer.values import sliders
 
-        handled = read_handled(self.path, lambda text: self._tell("reading", text))
+        handled = read_handled(self.path, lambda text: self.tell("reading", text))
         self.handled = handled
         scene = handled.staged.scene
         self.packet = scene_packet(scene, handled.title, self.start_pose)
-        self._tell("compiling", "compiling the scene")
+        self.tell("compiling", "compiling the scene")
         session = handled.session()
         self.sliders = sliders(session.material, scene.plan)
         # The first step also loads what runs at the first step only.
         self.frame = self._step(session, self.start_pose)
         session.reset()
         self._pose = self.start_pose
-        self._tell("ready", "ready")
         return session
 
-    def _tell(self, phase: Phase, text: str) -> None:
-        self.state = State(phase, text)
-        self.changed()
-
-    def _answer(self, session: Any) -> bool:
+    def answer(self, session: Any) -> bool:
         """One step; whether to go on."""
         with self._wake:
             self._wake.wait_for(lambda: self._pose is not None or self._ended)

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.config import SpecError
 from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.build import Staged, stage
 from jaxtrachea.scene.paths import path_of
@@ -58,8 +57,6 @@ def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> H
         SpecError: a file or a value that cannot be used, with its key.
     """
     spec = load_scene_spec(path)
-    if spec.names:
-        raise SpecError("tool: several tools; the page handles one: give a single [tool]")
     changed, notes = for_a_mouse(spec)
     staged = stage(changed, path.parent, lambda text: begin(text))
     if spec.tool is None:
