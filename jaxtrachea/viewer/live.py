@@ -17,6 +17,9 @@ from jaxtrachea.viewer.worker import Worker
 
 #: Steps that the curve keeps, and bytes of frames that a recording keeps.
 MOST_STEPS, MOST_BYTES = 20_000, 2**28
+#: Time after which a force that relaxes is computed anew under a hand that rests, s, and the change
+#: (N, mm) from which on it is shown.
+REST, SEEN = 0.05, (1e-5, 1e-3)
 
 
 class Live(Worker):
@@ -53,6 +56,7 @@ class Live(Worker):
         self._values: dict[str, float] = {}
         self._pose: np.ndarray | None = None
         self._last: np.ndarray | None = None
+        self._began = self._before = 0.0
         self._reset = False
 
     def move(self, pose: np.ndarray) -> None:
@@ -100,20 +104,22 @@ class Live(Worker):
         self.packet = scene_packet(scene, handled.title, self.start_pose)
         self.tell("compiling", "compiling the scene")
         session = handled.session()
-        self.sliders = sliders(session.material, scene.plan)
+        self.sliders = sliders(_long_run(session.material), scene.plan)
         # The first step also loads what runs at the first step only.
         self.frame = self._step(session, self.start_pose)
         session.reset()
-        self._pose = self.start_pose
+        self._pose, self._began = self.start_pose, time.monotonic()
         return session
 
     def answer(self, session: Any) -> bool:
         """One step; whether to go on."""
+        rest = REST if session.scene.plan.has("relaxation") and self._last is not None else None
         with self._wake:
-            self._wake.wait_for(lambda: self._pose is not None or self._ended)
-            if self._ended or self._pose is None:
+            moved = self._wake.wait_for(lambda: self._pose is not None or self._ended, rest)
+            if self._ended:
                 return False
-            pose, self._pose = self._pose, None
+            pose, self._pose = self._last if self._pose is None else self._pose, None
+            assert pose is not None
             values, reset, self._reset = dict(self._values), self._reset, False
         try:
             if reset:
@@ -124,6 +130,8 @@ class Live(Worker):
             traceback.print_exc()
             self.fault = f"{type(error).__name__}: {error}"
             self.changed()
+            return True
+        if not moved and self.frame is not None and _alike(frame, self.frame):
             return True
         self.frame, self.fault, self._last = frame, "", pose
         self.steps.append(frame.light)
@@ -136,22 +144,26 @@ class Live(Worker):
         """Other values of the material, where they are others."""
         import jax
 
-        now = session.material
+        whole, now = session.material, _long_run(session.material)
         new = {
             name: jax.device_put(np.asarray(value, getattr(now, name).dtype))
             for name, value in values.items()
             if float(getattr(now, name)) != value
         }
         if new:
-            session.set_material(dataclasses.replace(now, **new))
+            changed = dataclasses.replace(now, **new)
+            if now is not whole:
+                changed = dataclasses.replace(whole, material=changed)
+            session.set_material(changed)
 
     def _step(self, session: Any, pose: np.ndarray) -> Frame:
         from jaxtrachea.viewer.protocol import frame_of
 
-        begin = time.perf_counter()
-        result = session.step(pose[:9].reshape(3, 3), pose[9:])
-        seconds = time.perf_counter() - begin
-        return frame_of(session.scene.tool, pose, result, seconds)
+        begin = time.monotonic()
+        dt, self._before = begin - (self._before or begin), begin
+        result = session.step(pose[:9].reshape(3, 3), pose[9:], dt)
+        frame = frame_of(session.scene.tool, pose, result, time.monotonic() - begin)
+        return frame._replace(time=begin - self._began)
 
     def _record(self, frame: Frame) -> None:
         if self.recording is None:
@@ -161,3 +173,16 @@ class Live(Worker):
         if size * len(self.recording) > MOST_BYTES:
             self.fault = "the recording is full: the first half of its frames is thinned out"
             self.recording[:] = self.recording[::2]
+
+
+def _long_run(material: Any) -> Any:
+    """The values in the long run, of a material that relaxes as of any other."""
+    return getattr(material, "material", material)
+
+
+def _alike(a: Frame, b: Frame) -> bool:
+    """Whether nobody sees a difference."""
+    if a.status != b.status or a.vertices is None or b.vertices is None:
+        return a.status == b.status
+    force, place = abs(a.force - b.force).max(), abs(a.vertices - b.vertices).max()
+    return force < SEEN[0] and place < SEEN[1]

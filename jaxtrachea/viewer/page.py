@@ -146,13 +146,13 @@ class ScenePage(Page):
         """The steps as CSV."""
         text = io.StringIO()
         rows = csv.writer(text)
-        rows.writerow(["x_mm", "y_mm", "z_mm", "depth_mm", "force_x_N", "force_y_N", "force_z_N",
-                       "status"])  # fmt: skip
+        rows.writerow(["time_s", "x_mm", "y_mm", "z_mm", "depth_mm",
+                       "force_x_N", "force_y_N", "force_z_N", "status"])  # fmt: skip
         for f in self.live.steps:
-            numbers = [*f.pose[9:], f.depth, *f.force]
+            numbers = [f.time, *f.pose[9:], f.depth, *f.force]
             # No force is an empty cell, never a zero.
-            cells = [f"{v:.9g}" for v in (numbers if f.has_force else numbers[:3])]
-            rows.writerow([*cells, *[""] * (7 - len(cells)), f.status.name])
+            cells = [f"{v:.9g}" for v in (numbers if f.has_force else numbers[:4])]
+            rows.writerow([*cells, *[""] * (8 - len(cells)), f.status.name])
         ui.download.content(text.getvalue(), "curve.csv", "text/csv")
 
     def save_values(self) -> None:
