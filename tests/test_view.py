@@ -165,7 +165,7 @@ def browser(server):
     try:
         made.go(server.address)
         made.first = made.wait("document.querySelector('#status')?.innerText")
-        made.wait("window.trachea?.last", 240)
+        made.wait("window.trachea?.last", 600)
         yield made
     finally:
         made.close()
@@ -494,7 +494,8 @@ def test_a_fit_sample_by_sample(tmp_path):
     """It pauses, steps and settles; intervals shrink; the page is guarded as that of a scene."""
     force = synthetic.forces(TRUTH[None], displacement=DEPTHS)[0][0]
     force = force + 0.02 * np.random.default_rng(0).normal(size=force.shape)
-    rows = [f"T1,p{i},{s},{d},{f}" for i, (s, row) in enumerate(zip(synthetic.S_C, force, strict=True))
+    presses = enumerate(zip(synthetic.S_C, force, strict=True))
+    rows = [f"T1,p{i},{s},{d},{f}" for i, (s, row) in presses
             for d, f in zip(DEPTHS, row, strict=True)]  # fmt: skip
     head = "specimen,trial,s_mm,displacement_mm,force_N"
     (tmp_path / "curves.csv").write_text("\n".join([head, *rows]) + "\n")
