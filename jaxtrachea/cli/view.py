@@ -65,7 +65,8 @@ def _content(file: Path) -> dict:
     except SpecError as error:
         raise Stop(str(error)) from None
     legs = content.get("path", [])
-    named = isinstance(legs, list) and any("tool" in leg for leg in legs if isinstance(leg, dict))
+    legs = legs if isinstance(legs, list) else [legs]
+    named = any(isinstance(leg, dict) and "tool" in leg for leg in legs)
     if isinstance(content.get("tool"), list) or named:
         raise Stop(
             f"{file}: tool: several tools, and the page moves one; give a single [tool], or see "

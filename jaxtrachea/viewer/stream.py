@@ -92,8 +92,9 @@ class Stream(Worker):
         self.take(made.online)
         if self.left or self._taken < len(self.presses[-1][1].force):
             return True
-        self.states.append(made.online.settle())
+        settled = made.online.settle()
         self.playing, self.done = False, True
+        self.states.append(settled)  # last: pages draw where there is a new state
         return False
 
     def take(self, online: Any) -> None:

@@ -122,7 +122,7 @@ class StreamPage(Page):
         stream, state = self.stream, experiment.online.state
         text = f"{state.samples} samples, {state.status.name}; "
         if stream.done:
-            text += "all are taken, and the estimate has settled: it is that of a fit of them"
+            text += "all are taken, and the estimate has settled"
         elif stream.presses:
             curve, number = stream.presses[-1][1], len(stream.presses)
             text += f"press {number} of {len(experiment.curves)}: {curve.trial} at {curve.s_c:g} mm"
