@@ -14,6 +14,7 @@ from jaxtrachea.inference.design.candidates import Candidates
 from jaxtrachea.inference.design.choice import next_points
 from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.status import FitStatus
+from jaxtrachea.viewer.stream import Experiment, Stream
 
 pytestmark = pytest.mark.long
 
@@ -34,6 +35,11 @@ def online(parameters=None, **changes):
 def measured(s=S, truth=TRUTH, seed=0):
     force = synthetic.forces(truth[None], s_c=s)[0][0]
     return force + SIGMA * np.random.default_rng(seed).normal(size=force.shape)
+
+
+def intervals(result):
+    found = [assess(result, 0, i) for i in range(4)]
+    return [[a.low for a in found], [a.high for a in found]]
 
 
 def pressed(one, force, s=S, displacement=synthetic.DEPTHS):
@@ -66,6 +72,7 @@ def test_settled_it_is_the_fit_of_the_same_samples(run):
         settled.standard_error, [a.standard_error for a in of_fit], rtol=1e-6
     )
     np.testing.assert_allclose(settled.relative_error, [a.relative_se for a in of_fit], rtol=1e-6)
+    np.testing.assert_allclose([settled.low, settled.high], intervals(result), rtol=1e-6)
     # The last sample had left little to settle: a hundredth of a standard error.
     last = (states[-1].value - settled.value) / settled.standard_error
     assert np.max(np.abs(last)) < 0.03
@@ -108,6 +115,7 @@ def test_what_one_position_leaves_open_is_said_until_there_is_another(run):
     assert first.status == FitStatus.UNIDENTIFIABLE
     assert first.verdict[:2] == ("structurally non-identifiable",) * 2
     assert np.isnan(first.standard_error[:2]).all()
+    assert (first.low[1], first.high[1]) == pytest.approx((1e-6, 1e6))  # its bounds
     assert np.isfinite(first.standard_error[2:]).all()
     assert np.isfinite(second.standard_error).all()
     # So few positions may have another skeleton that fits as well: nothing is promised.
@@ -155,6 +163,33 @@ def test_a_sample_compiles_nothing_and_many_take_room(run):
     np.testing.assert_allclose(whole.settle().value, several.settle().value, rtol=1e-8)
 
 
+def test_the_stream_of_a_page_takes_every_sample_once(run):
+    """In any order it ends where the fit of the samples does; a fault leaves its press out."""
+    one, _, settled, _ = run
+    stream = Stream("fit.toml", lambda _: Experiment(online(), one.curves, {}))
+    stream.pace(1e9)
+    stream.choose(True)
+    stream.play(True)
+    first = online().state.next_point
+    stream.run()
+    assert (stream.state.phase, stream.fault, stream.done) == ("ready", "", True)
+    assert len(stream.states) == 200 + 1
+    assert [n for n, _ in stream.presses] == [0, 50, 100, 150]
+    assert stream.presses[0][1].s_c == min(S, key=lambda s: abs(s - first))
+    np.testing.assert_allclose(stream.states[-1].value, settled.value, rtol=1e-6)
+
+    deep = dataclasses.replace(one.curves[0], displacement=100 + one.curves[0].displacement)
+    stream = Stream("fit.toml", lambda _: Experiment(online(), [deep, one.curves[1]], {}))
+    made = stream.prepare()
+    for taken in (0, 1, 2):  # the fault, then two samples
+        stream.step()
+        assert stream.answer(made)
+        assert len(stream.states) == taken
+    assert stream.fault.startswith("1: displacement is 100.1 mm; expected at most the radius")
+    stream.end()
+    assert not stream.answer(made)
+
+
 def test_on_a_bound():
     """No cubic term: it ends on its bound, the others where the fit has them."""
     truth = TRUTH * [1, 1, 4, 1e-9]
@@ -166,6 +201,8 @@ def test_on_a_bound():
     assert settled.value[3] == pytest.approx(1e-3)
     assert settled.status == FitStatus.AT_BOUND == result.status[0]
     np.testing.assert_allclose(settled.value, result.value[0], rtol=1e-6)
+    # Of the estimate and of its error.
+    np.testing.assert_allclose([settled.low, settled.high], intervals(result), rtol=2e-6)
 
 
 def test_a_record_with_a_zero_of_its_own_is_named():

@@ -20,6 +20,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import synthetic
 
 pytest.importorskip("nicegui", reason="the extra 'viewer' is not installed")
 from browser import CHROMIUM, Browser
@@ -30,6 +31,7 @@ from websockets.sync.client import connect
 from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.status import PressStatus
 from jaxtrachea.viewer.frame import LONGEST, Frame, read_pose
+from jaxtrachea.viewer.live import Live
 from jaxtrachea.viewer.play import PlayError, of_file
 from jaxtrachea.viewer.scene import for_a_mouse
 from jaxtrachea.viewer.values import Slider, with_values
@@ -57,6 +59,17 @@ steps = 4
 """
 #: Positions of the tool: pressed on and off the midline, clear, behind the ends of the rings.
 PLACES = np.array([[30.0, 16.2, 0.0], [21.0, 14.0, 9.0], [30.0, 25.0, 0.0], [30.0, -15.0, 0.0]])
+#: An experiment: EI_L, k_M, k_1, k_3, and its specification.
+TRUTH, DEPTHS = np.array([300.0, 1.0, 0.5, 0.2]), np.linspace(0.5, 6.0, 12)
+FIT = """[data]
+files = "curves.csv"
+[noise]
+force = "0.02 N"
+[parameters]
+onset = { fixed = 0.0 }
+force_offset = { fixed = 0.0 }
+"""
+CONFIGS = Path(__file__).parents[1] / "configs"
 FORCE = "document.querySelector('[data-role=force]').innerText"
 DETAIL = "document.querySelector('[data-role=detail]').innerText"
 
@@ -76,15 +89,11 @@ def simulated(server):
 
 
 class Server:
-    """`jaxtrachea view` in a process of its own; `lines`: what it has printed."""
+    """A page in a process of its own; `lines`: what it has printed."""
 
-    def __init__(self, scene):
+    def __init__(self, *arguments):
         """Start it, and wait for its address."""
-        script = Path(__file__).parent / "reference" / "serve_page.py"
-        self.simulation = scene.with_name("simulation.h5")
-        np.save(scene.with_name("places.npy"), PLACES)
-        files = scene, scene.with_name("places.npy"), self.simulation
-        command = [sys.executable, str(script), *map(str, files)]
+        command = [sys.executable, *map(str, arguments)]
         env = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"}
         self.lines = []
         self.process = subprocess.Popen(
@@ -139,7 +148,12 @@ class Server:
 
 @pytest.fixture(scope="module")
 def server(scene_file):
-    made = Server(scene_file)
+    """`view` of the scene, after `simulate` of the places."""
+    script = Path(__file__).parent / "reference" / "serve_page.py"
+    places, simulation = (scene_file.with_name(n) for n in ("places.npy", "simulation.h5"))
+    np.save(places, PLACES)
+    made = Server(script, scene_file, places, simulation)
+    made.simulation = simulation
     yield made
     made.end()
 
@@ -151,7 +165,7 @@ def browser(server):
     try:
         made.go(server.address)
         made.first = made.wait("document.querySelector('#status')?.innerText")
-        made.wait("window.trachea?.last", 240)
+        made.wait("window.trachea?.last", 600)
         yield made
     finally:
         made.close()
@@ -417,6 +431,134 @@ def test_bad_input_ends_the_command(server, scene_file, tmp_path, monkeypatch, c
     none = run(monkeypatch, capsys, "play", tmp_path / "none.h5")
     assert none[0] == 2
     assert "name a simulation.h5" in none[2]
+    broken = tmp_path / "broken.toml"
+    broken.write_text("[path")
+    assert "not valid TOML" in run(monkeypatch, capsys, "view", broken)[2]
+
+
+#: Scenes that no hand can move, and why.
+UNMOVED = {"two_fingers": "several tools", "retractor": "several tools",
+           "cross_sections": "deforming cross-sections"}  # fmt: skip
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda p: p.stem)
+def test_each_scene_is_refused_before_the_page_or_can_be_moved(path, monkeypatch, capsys):
+    if path.stem in UNMOVED:
+        code, _, said = run(monkeypatch, capsys, "view", path)
+        assert code == 2
+        assert UNMOVED[path.stem] in said
+        assert f"jaxtrachea simulate {path}" in " ".join(said.split())
+        return
+    spec, _ = for_a_mouse(load_scene_spec(path))
+    relaxes = path.stem == "relaxation"
+    assert spec.tool is not None
+    assert (spec.relaxation is not None) == relaxes
+    assert spec.path[-1].duration == (1000.0 if relaxes else None)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_a_force_that_relaxes_falls_while_the_hand_rests(tmp_path):
+    """From the jump to the long run; a twelfth of the force lasts beyond it in 0.2 s, none in 2."""
+    scene = tmp_path / "relaxing.toml"
+    law = '[relaxation]\nbranches = "prony-1"\ngamma_1 = 1.0\ntau_1 = "0.08 s"\n'
+    scene.write_text(SCENE.replace("[tool]", law + "[tool]"))
+    live = Live(scene)
+    thread = threading.Thread(target=live.run)
+    thread.start()
+    try:
+        wait_until(lambda: live.state.phase in ("ready", "failed") and live.steps, 600)
+        assert live.state.phase == "ready", live.state
+        clear = len(live.steps)
+        time.sleep(0.5)
+        assert len(live.steps) == clear  # nothing changes, nothing is shown
+        pose = live.start_pose
+        pose[9:] = PLACES[0]
+        live.move(pose)
+        time.sleep(3.0)
+        steps = [f for f in live.steps if f.has_force]
+    finally:
+        live.end()
+        thread.join()
+    force = np.array([np.linalg.norm(f.force) for f in steps])
+    assert len(force) > 4
+    assert (np.diff(force) < 0).all()
+    session = live.handled.session()
+    pose = live.start_pose[:9].reshape(3, 3)
+    session.step(pose, live.start_pose[9:], 0.0)
+    lasting = np.linalg.norm(session.step(pose, PLACES[0], 1e9).force)
+    assert force[-1] == pytest.approx(lasting, rel=1e-3)
+    assert 1.0 < force[0] / lasting <= 2.0  # 1 + gamma of a jump
+    begin = np.array([f.time for f in steps]) - steps[0].time
+    decay = (force / lasting - 1) / (force[0] / lasting - 1)
+    seen = begin < 0.3
+    np.testing.assert_allclose(decay[seen], np.exp(-begin[seen] / 0.08), atol=0.02)
+
+
+def wait_until(true, seconds):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@needs_browser
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_a_fit_sample_by_sample(tmp_path):
+    """It pauses, steps and settles; intervals shrink; the page is guarded as that of a scene."""
+    force = synthetic.forces(TRUTH[None], displacement=DEPTHS)[0][0]
+    force = force + 0.02 * np.random.default_rng(0).normal(size=force.shape)
+    presses = enumerate(zip(synthetic.S_C, force, strict=True))
+    rows = [f"T1,p{i},{s},{d},{f}" for i, (s, row) in presses
+            for d, f in zip(DEPTHS, row, strict=True)]  # fmt: skip
+    head = "specimen,trial,s_mm,displacement_mm,force_N"
+    (tmp_path / "curves.csv").write_text("\n".join([head, *rows]) + "\n")
+    (tmp_path / "fit.toml").write_text(FIT)
+    server, window = Server("-m", "jaxtrachea", "view", tmp_path / "fit.toml", "--no-browser"), None
+    try:
+        window = Browser()
+        window.go(server.address)
+        window.wait("document.querySelector('#play')", 400)
+        where = "document.querySelector('#where').innerText"
+        assert window.run(where).startswith("0 samples, TOO_FEW_DATA; 4 presses are there")
+        for n in (1, 2):
+            window.run("document.querySelector('#step').click()")
+            window.wait(f"{where}.startsWith('{n} samples')")
+        window.run("document.querySelector('#play').click()")
+        window.wait(f"parseInt({where}) > 30")
+        window.run("document.querySelector('#play').click()")
+        time.sleep(1)
+        count = window.run(where)
+        before = lengths(window)
+        time.sleep(1)
+        assert window.run(where) == count
+        window.run("document.querySelector('#play').click()")
+        window.wait(f"/settled/.test({where})", 60)
+        after = lengths(window)
+        assert list(after) == ["EI_L", "k_M", "k_1", "k_3"]
+        assert all(after[name][1] < before[name][1] for name in after)
+        inside = [low <= t <= high for t, (low, _, high) in zip(TRUTH, after.values(), strict=True)]
+        assert sum(inside) >= 3
+        assert not window.errors
+        hosts = {a.split("/")[2] for a in window.requests if not a.startswith(("data:", "blob:"))}
+        assert hosts == {f"127.0.0.1:{server.port}"}
+        assert server.get("/")[0] == 403
+        stranger = {"Origin": "http://evil.example"}
+        assert server.get(f"/?token={server.token}", **stranger)[0] == 403
+    finally:
+        server.end()
+        if window is not None:
+            window.close()
+    assert "Warning" not in "".join(server.lines)
+
+
+def lengths(window):
+    """Of every parameter of the table low end, length and high end of its interval."""
+    rows = window.run("document.querySelector('#estimates').innerText").splitlines()[1:]
+    cells = [row.split("\t") for row in rows]
+    ends = {c[0]: [float(v) for v in c[2].split(" to ")] for c in cells}
+    return {name: (low, high - low, high) for name, (low, high) in ends.items()}
 
 
 def test_a_scene_without_a_tool_gets_a_finger(scene_file):
@@ -462,7 +604,6 @@ def test_a_frame_without_a_solution_has_no_numbers():
 
 def test_the_event_loop_is_left_alone_by_a_thread():
     """What the thread calls when no page has come does nothing."""
-    from jaxtrachea.viewer.live import Live
     from jaxtrachea.viewer.server import Frames
 
     async def make():
@@ -472,8 +613,6 @@ def test_the_event_loop_is_left_alone_by_a_thread():
 
 
 def test_what_cannot_be_read_is_said(tmp_path):
-    from jaxtrachea.viewer.live import Live
-
     live = Live(tmp_path / "none.toml")
     live.run()
     assert live.state.phase == "failed"

@@ -1,7 +1,8 @@
-"""The commands for the page: view a scene, and write a simulation as a page that plays."""
+"""The commands for pages: a scene under the hand, a fit as a stream, a simulation that plays."""
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +10,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.cli.scene import SceneArgument
 from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
+from jaxtrachea.files.toml import SpecError, read_tables
 
 PortOption = Annotated[
     int | None, typer.Option("--port", min=1, max=65535, help="Of 127.0.0.1; none: a free one.")
@@ -19,10 +20,13 @@ NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Only print the ad
 EXTRA = "needs the extra 'viewer': pip install 'jaxtrachea[viewer]'"
 
 
-def view(scene: SceneArgument, port: PortOption = None, no_browser: NoBrowser = False) -> None:
-    """Handle the trachea in the browser: mouse, keys, sliders."""
-    if not scene.is_file():
-        raise Stop(f"{scene}: there is no such file; name a scene (TOML)")
+def view(
+    file: Annotated[Path, typer.Argument(help="Scene, or fit specification (TOML).")],
+    port: PortOption = None,
+    no_browser: NoBrowser = False,
+) -> None:
+    """Handle a scene in the browser, or see a fit sample by sample."""
+    content = _content(file)
     try:
         from jaxtrachea.viewer.server import free_port
     except ModuleNotFoundError as error:
@@ -32,14 +36,79 @@ def view(scene: SceneArgument, port: PortOption = None, no_browser: NoBrowser = 
     except OSError as error:
         cure = "choose another, or leave --port out"
         raise Stop(f"--port: {port} cannot be used ({error.strerror}); {cure}") from None
-    from jaxtrachea.viewer.page import serve
 
     def opened(address: str) -> None:
         Console().print(f"{escape(address)}  (Ctrl-C ends it)", highlight=False, soft_wrap=True)
         if not no_browser and not _open(address):
             to_stderr("no browser could be opened: open the address yourself, or use --no-browser")
 
-    serve(scene, port, opened, set_up_jax)
+    if "data" in content:
+        from jaxtrachea.viewer.stream_page import serve_stream
+
+        serve_stream(file.name, lambda begin: _experiment(file, begin), port, opened)
+    else:
+        from jaxtrachea.viewer.page import serve_scene
+
+        serve_scene(file, port, opened, set_up_jax)
+
+
+def _content(file: Path) -> dict:
+    """Tables of a scene or a fit.
+
+    Raises:
+        Stop: no such file, no TOML, or a scene that no hand can move.
+    """
+    if not file.is_file():
+        raise Stop(f"{file}: there is no such file; name a scene or a fit specification (TOML)")
+    try:
+        content = read_tables(file, "scene")
+    except SpecError as error:
+        raise Stop(str(error)) from None
+    legs = content.get("path", [])
+    legs = legs if isinstance(legs, list) else [legs]
+    named = any(isinstance(leg, dict) and "tool" in leg for leg in legs)
+    if isinstance(content.get("tool"), list) or named:
+        raise Stop(
+            f"{file}: tool: several tools, and the page moves one; give a single [tool], or see "
+            f"them by jaxtrachea simulate {file} (pictures; vtk and animation in [output])"
+        )
+    for name in ("wall", "sections"):
+        if name in content and "data" not in content:
+            raise Stop(
+                f"{file}: {name}: deforming cross-sections are not solved step by step, as a hand "
+                f"needs it; give [material] in its place, or jaxtrachea simulate {file}"
+            )
+    return content
+
+
+def _experiment(path: Path, begin: Callable[[str], None]):
+    """The curves of a fit specification, and the `Online` that will take their samples.
+
+    Raises:
+        ValueError: what cannot be read, or cannot be fitted sample by sample.
+    """
+    from jaxtrachea.cli.load import load
+    from jaxtrachea.inference.online import Online
+    from jaxtrachea.viewer.stream import Experiment
+
+    try:
+        _, measurements, study = load(path, None)
+    except Stop as stop:
+        raise ValueError(str(stop)) from None
+    curves, recipe = measurements.curves, study.recipe
+    if len(specimens := sorted({c.specimen for c in curves})) > 1:
+        raise ValueError(
+            f"{path}: data: {len(specimens)} specimens ({specimens[0]}, {specimens[1]}, ...); a "
+            "stream is of one: name its files alone in data.files"
+        )
+    begin("compiling the fit of a sample")
+    online = Online(
+        recipe.geometry, recipe.options, recipe.parameters, noise=recipe.noise,
+        depth=max(float(c.displacement.max()) for c in curves),
+        candidates=sorted({c.s_c for c in curves}),
+        samples=round(sum(len(c.force) for c in curves) / len(curves)),
+    )  # fmt: skip
+    return Experiment(online, curves, {p.name: p.unit for p in recipe.parameters})
 
 
 def play(

@@ -40,9 +40,33 @@ def load_spec(
     Raises:
         SpecError: as `load_fit_spec`.
     """
+    content = read_tables(path, called)
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        for table, other in (others or {}).items():
+            if table in content:
+                found = f"has a table [{table}], so it is {other}"
+                raise SpecError(found, place=str(path), expected=f"a {called}") from None
+        lines = _lines(error, kind)
+        more = f"\n... and {len(lines) - MAX_LINES} more" if len(lines) > MAX_LINES else ""
+        told = f"\n{path}: ".join(lines[:MAX_LINES])
+        raise SpecError(f"{told}{more}", place=str(path)) from None
+
+
+def read_tables(path: Path, called: str) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Args:
+        path: of the file.
+        called: what a user calls it.
+
+    Raises:
+        SpecError: it cannot be read, or is no TOML.
+    """
     text = _text(path, called)
     try:
-        content = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SpecError(f"not valid TOML: {_at_line(error, text)}", place=str(path)) from None
     except RecursionError:
@@ -55,17 +79,6 @@ def load_spec(
             place=str(path),
             expected="4300 digits at most",
         ) from None
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        for table, other in (others or {}).items():
-            if table in content:
-                found = f"has a table [{table}], so it is {other}"
-                raise SpecError(found, place=str(path), expected=f"a {called}") from None
-        lines = _lines(error, kind)
-        more = f"\n... and {len(lines) - MAX_LINES} more" if len(lines) > MAX_LINES else ""
-        told = f"\n{path}: ".join(lines[:MAX_LINES])
-        raise SpecError(f"{told}{more}", place=str(path)) from None
 
 
 def _text(path: Path, called: str) -> str:

@@ -5,11 +5,9 @@ blocks of samples linearised anew. It follows one minimum from the first guess; 
 other, and intervals beyond the local error, are for `fitting.fit.fit` of `Online.study`.
 """
 
-from typing import NamedTuple
-
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from jaxtrachea._arguments import check_word
@@ -34,6 +32,7 @@ from jaxtrachea.inference.design.situation import Situation, of_bounds
 from jaxtrachea.inference.online_model import (
     CURE,
     SPECIMEN,
+    OnlineState,
     blank_study,
     check,
     deepest,
@@ -48,38 +47,6 @@ from jaxtrachea.trachea.geometry import Geometry
 #: Move of the estimate from which on the gains of presses are computed anew, in natural sizes of
 #: the unknowns (1: 100 %).
 MOVED = 0.02
-
-
-class OnlineState(NamedTuple):
-    """What is known after a sample; P unknowns in the order of `names`, numpy float64.
-
-    Attributes:
-        names: of the unknowns.
-        value: estimates in the units of the parameters; (P,).
-        standard_error: likewise, as tables of a fit have it: with the growth of correlated
-            residuals; NaN where the samples do not determine the unknown; (P,).
-        relative_error: `standard_error` over the value (scale `log`: of the logarithm); (P,).
-        covariance: in scaled coordinates, of independent residuals, as `Uncertainty.covariance`;
-            (P, P).
-        verdict: one of `VERDICTS` for every unknown, of the local error alone; "failed" without an
-            estimate.
-        next_point: position of the most telling next press, mm, as far as estimate and model can
-            be trusted; the bounds count as a weak prior, so that there is one before any sample.
-        samples: so far.
-        status: as of a fit; NON_FINITE: a sample without equilibrium at the estimate.
-        message: what speaks against the estimate, "" if nothing does.
-    """
-
-    names: tuple[str, ...]
-    value: Float[np.ndarray, " P"]
-    standard_error: Float[np.ndarray, " P"]
-    relative_error: Float[np.ndarray, " P"]
-    covariance: Float[np.ndarray, "P P"]
-    verdict: tuple[str, ...]
-    next_point: float
-    samples: int
-    status: FitStatus
-    message: str
 
 
 class Online:
@@ -253,10 +220,15 @@ class Online:
         se = np.where(told & ~open_ & np.isfinite(errors.se), errors.se, np.nan)[0]
         se = se * (worth.factor[0] if told else np.nan)
         log, step = self._scales
-        value = np.where(log, np.exp(minimum.theta), minimum.theta * step)
+        side = (errors.se * errors.half_width[0] * worth.growth[0])[0]
+        side = np.where(open_[0], np.inf, side) if status.succeeded else np.nan
+        theta, lower, upper = minimum.theta, study.lanes.lower[0], study.lanes.upper[0]
+        ends = np.array([np.maximum(theta - side, lower), theta, np.minimum(theta + side, upper)])
+        low, value, high = np.where(log, np.exp(np.where(log, ends, 0)), ends * step)
         return OnlineState(
             names=tuple(p.name for p, _, _ in study.unknowns[0]), value=value,
-            standard_error=se * np.where(log, value, step), relative_error=se / relative[0],
+            standard_error=se * np.where(log, value, step), low=low, high=high,
+            relative_error=se / relative[0],
             covariance=errors.covariance[0], verdict=tuple(words),
             next_point=self._next(float(worth.factor[0]) if told else 1.0),
             samples=int(count[0]), status=status, message=message,

@@ -1,6 +1,9 @@
 """What a stream of samples can be fitted with: model, noise, and where it may be pressed."""
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxtrachea._errors import InputError
@@ -12,6 +15,7 @@ from jaxtrachea.inference.design.candidates import Candidates
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 #: What the curves of a stream belong to.
@@ -20,6 +24,43 @@ SPECIMEN = "online"
 PLACES = 25
 #: What to do about whatever takes whole curves.
 CURE = "fit the curves together by build_study and fit"
+
+
+class OnlineState(NamedTuple):
+    """What is known after a sample; P unknowns in the order of `names`, numpy float64.
+
+    Attributes:
+        names: of the unknowns.
+        value: estimates in the units of the parameters; (P,).
+        standard_error: likewise, as tables of a fit have it: with the growth of correlated
+            residuals; NaN where the samples do not determine the unknown; (P,).
+        low: 95 % interval, local, as tables of a fit have it: the bound where the samples leave the
+            unknown open, NaN of an estimate on its bound and without one; (P,).
+        high: likewise.
+        relative_error: `standard_error` over the value (scale `log`: of the logarithm); (P,).
+        covariance: in scaled coordinates, of independent residuals, as `Uncertainty.covariance`;
+            (P, P).
+        verdict: one of `VERDICTS` for every unknown, of the local error alone; "failed" without an
+            estimate.
+        next_point: position of the most telling next press, mm, as far as estimate and model can
+            be trusted; the bounds count as a weak prior, so that there is one before any sample.
+        samples: so far.
+        status: as of a fit; NON_FINITE: a sample without equilibrium at the estimate.
+        message: what speaks against the estimate, "" if nothing does.
+    """
+
+    names: tuple[str, ...]
+    value: Float[np.ndarray, " P"]
+    standard_error: Float[np.ndarray, " P"]
+    low: Float[np.ndarray, " P"]
+    high: Float[np.ndarray, " P"]
+    relative_error: Float[np.ndarray, " P"]
+    covariance: Float[np.ndarray, "P P"]
+    verdict: tuple[str, ...]
+    next_point: float
+    samples: int
+    status: FitStatus
+    message: str
 
 
 def check(options: Options, noise: Noise) -> None:

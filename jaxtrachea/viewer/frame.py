@@ -30,6 +30,7 @@ class Frame(NamedTuple):
         point: of the contact on the tool, mm; shape (3,).
         seconds: that the step took.
         vertices: of the wall, mm, float32; shape (vertices, 3). None: no solution.
+        time: since the scene was ready, s.
     """
 
     status: PressStatus
@@ -39,6 +40,7 @@ class Frame(NamedTuple):
     point: Float[np.ndarray, "3"]
     seconds: float
     vertices: np.ndarray | None
+    time: float = 0.0
 
     @property
     def has_force(self) -> bool:

@@ -4,30 +4,25 @@ What is slow to import is imported by the thread: the page is up before.
 """
 
 import dataclasses
-import threading
 import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxtrachea.viewer.frame import Frame
+from jaxtrachea.viewer.worker import Worker
 
-Phase = Literal["reading", "compiling", "ready", "failed"]
 #: Steps that the curve keeps, and bytes of frames that a recording keeps.
 MOST_STEPS, MOST_BYTES = 20_000, 2**28
+#: Time after which a force that relaxes is computed anew under a hand that rests, s, and the change
+#: (N, mm) from which on it is shown.
+REST, SEEN = 0.05, (1e-5, 1e-3)
 
 
-class State(NamedTuple):
-    """Where the work stands; `text` says it to the user."""
-
-    phase: Phase
-    text: str
-
-
-class Live:
+class Live(Worker):
     """A scene under a hand.
 
     The thread reads and compiles, then answers poses and values one after the other. A pose that
@@ -35,9 +30,6 @@ class Live:
 
     Attributes:
         path: of the scene file.
-        changed: called by the thread when there is a new frame or state.
-        state: where the work stands.
-        fault: the last error of a step; empty: none.
         handled: the scene, once it is read.
         sliders: of its parameters, likewise.
         packet: the scene as bytes, likewise.
@@ -53,9 +45,8 @@ class Live:
             path: of the scene file.
             set_up: called by the thread before it reads.
         """
+        super().__init__(path.name)
         self.path, self.set_up = path, set_up
-        self.changed: Callable[[], None] = lambda: None
-        self.state, self.fault = State("reading", f"reading {path.name}"), ""
         self.handled: Any = None
         self.sliders: list[Any] = []
         self.packet = b""
@@ -65,26 +56,8 @@ class Live:
         self._values: dict[str, float] = {}
         self._pose: np.ndarray | None = None
         self._last: np.ndarray | None = None
-        self._reset = self._ended = False
-        self._wake = threading.Condition()
-
-    def start(self) -> None:
-        """Begin in a thread of its own."""
-        threading.Thread(target=self.run, name="session", daemon=True).start()
-
-    def run(self) -> None:
-        """Read, compile, and answer until `end`; what fails is told in `state`."""
-        try:
-            session = self._prepare()
-        except (ValueError, OSError) as error:
-            self._tell("failed", str(error))
-            return
-        except Exception as error:  # of the program: the page says it, the terminal shows where
-            traceback.print_exc()
-            self._tell("failed", f"{type(error).__name__}: {error}; the terminal shows where")
-            return
-        while self._answer(session):
-            pass
+        self._began = self._before = 0.0
+        self._reset = False
 
     def move(self, pose: np.ndarray) -> None:
         """Move the tool: rotation by rows, then translation, mm; shape (12,)."""
@@ -107,12 +80,6 @@ class Live:
             self._pose = self.start_pose
             self._wake.notify()
 
-    def end(self) -> None:
-        """End the thread after its step."""
-        with self._wake:
-            self._ended = True
-            self._wake.notify()
-
     @property
     def start_pose(self) -> np.ndarray:
         """Of the tool at the start; shape (12,)."""
@@ -124,38 +91,35 @@ class Live:
         """Of all sliders, as they are now."""
         return {s.name: s.value for s in self.sliders} | self._values
 
-    def _prepare(self) -> Any:
+    def prepare(self) -> Any:
         """The session."""
         self.set_up()
         from jaxtrachea.viewer.protocol import scene_packet
         from jaxtrachea.viewer.scene import read_handled
         from jaxtrachea.viewer.values import sliders
 
-        handled = read_handled(self.path, lambda text: self._tell("reading", text))
+        handled = read_handled(self.path, lambda text: self.tell("reading", text))
         self.handled = handled
         scene = handled.staged.scene
         self.packet = scene_packet(scene, handled.title, self.start_pose)
-        self._tell("compiling", "compiling the scene")
+        self.tell("compiling", "compiling the scene")
         session = handled.session()
-        self.sliders = sliders(session.material, scene.plan)
+        self.sliders = sliders(_long_run(session.material), scene.plan)
         # The first step also loads what runs at the first step only.
         self.frame = self._step(session, self.start_pose)
         session.reset()
-        self._pose = self.start_pose
-        self._tell("ready", "ready")
+        self._pose, self._began = self.start_pose, time.monotonic()
         return session
 
-    def _tell(self, phase: Phase, text: str) -> None:
-        self.state = State(phase, text)
-        self.changed()
-
-    def _answer(self, session: Any) -> bool:
+    def answer(self, session: Any) -> bool:
         """One step; whether to go on."""
+        rest = REST if session.scene.plan.has("relaxation") and self._last is not None else None
         with self._wake:
-            self._wake.wait_for(lambda: self._pose is not None or self._ended)
-            if self._ended or self._pose is None:
+            moved = self._wake.wait_for(lambda: self._pose is not None or self._ended, rest)
+            if self._ended:
                 return False
-            pose, self._pose = self._pose, None
+            pose, self._pose = self._last if self._pose is None else self._pose, None
+            assert pose is not None
             values, reset, self._reset = dict(self._values), self._reset, False
         try:
             if reset:
@@ -166,6 +130,8 @@ class Live:
             traceback.print_exc()
             self.fault = f"{type(error).__name__}: {error}"
             self.changed()
+            return True
+        if not moved and self.frame is not None and _alike(frame, self.frame):
             return True
         self.frame, self.fault, self._last = frame, "", pose
         self.steps.append(frame.light)
@@ -178,22 +144,26 @@ class Live:
         """Other values of the material, where they are others."""
         import jax
 
-        now = session.material
+        whole, now = session.material, _long_run(session.material)
         new = {
             name: jax.device_put(np.asarray(value, getattr(now, name).dtype))
             for name, value in values.items()
             if float(getattr(now, name)) != value
         }
         if new:
-            session.set_material(dataclasses.replace(now, **new))
+            changed = dataclasses.replace(now, **new)
+            if now is not whole:
+                changed = dataclasses.replace(whole, material=changed)
+            session.set_material(changed)
 
     def _step(self, session: Any, pose: np.ndarray) -> Frame:
         from jaxtrachea.viewer.protocol import frame_of
 
-        begin = time.perf_counter()
-        result = session.step(pose[:9].reshape(3, 3), pose[9:])
-        seconds = time.perf_counter() - begin
-        return frame_of(session.scene.tool, pose, result, seconds)
+        begin = time.monotonic()
+        dt, self._before = begin - (self._before or begin), begin
+        result = session.step(pose[:9].reshape(3, 3), pose[9:], dt)
+        frame = frame_of(session.scene.tool, pose, result, time.monotonic() - begin)
+        return frame._replace(time=begin - self._began)
 
     def _record(self, frame: Frame) -> None:
         if self.recording is None:
@@ -203,3 +173,16 @@ class Live:
         if size * len(self.recording) > MOST_BYTES:
             self.fault = "the recording is full: the first half of its frames is thinned out"
             self.recording[:] = self.recording[::2]
+
+
+def _long_run(material: Any) -> Any:
+    """The values in the long run, of a material that relaxes as of any other."""
+    return getattr(material, "material", material)
+
+
+def _alike(a: Frame, b: Frame) -> bool:
+    """Whether nobody sees a difference."""
+    if a.status != b.status or a.vertices is None or b.vertices is None:
+        return a.status == b.status
+    force, place = abs(a.force - b.force).max(), abs(a.vertices - b.vertices).max()
+    return force < SEEN[0] and place < SEEN[1]

@@ -1,8 +1,7 @@
-"""The page: the view, the curve, the sliders; and the server that runs it."""
+"""The page of a scene: the view, the curve, the sliders."""
 
 import csv
 import io
-import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,10 @@ from nicegui.element import Element
 from nicegui.elements.scene.scene import Scene as _Scene  # registers the module that holds three.js
 
 from jaxtrachea.viewer.live import Live
-from jaxtrachea.viewer.server import Frames, Guard, add_routes
+from jaxtrachea.viewer.serve import SMALL, Page, serve
+from jaxtrachea.viewer.server import Frames, add_routes
 
-__all__ = ["serve"]
+__all__ = ["serve_scene"]
 
 _ = _Scene
 KEYS = (
@@ -27,75 +27,32 @@ class Wall(Element, component="wall.js"):
     """The view of the scene."""
 
 
-def serve(path: Path, port: int, opened: Callable[[str], None], set_up: Callable[[], None]) -> None:
-    """Serve the page of a scene on 127.0.0.1 until Ctrl-C.
+def serve_scene(
+    path: Path, port: int, opened: Callable[[str], None], set_up: Callable[[], None]
+) -> None:
+    """Serve the page of a scene until Ctrl-C.
 
     Args:
         path: of the scene file.
-        port: that is free.
-        opened: called with the address when the page can be opened.
+        port: see `serve`.
+        opened: likewise.
         set_up: called by the thread of the session before it reads.
     """
-    token = secrets.token_urlsafe(24)
     live = Live(path, set_up)
     frames = Frames(live)
     live.changed = frames.changed
-    app.add_middleware(Guard, port=port, token=token)
     add_routes(app, live, frames)
-    ui.page("/", title=f"{path.name} - jaxtrachea")(lambda: Page(live).build())
-
-    def started() -> None:
-        opened(f"http://127.0.0.1:{port}/?token={token}")
-        live.start()
-
-    app.on_startup(started)
-    app.on_shutdown(live.end)
-    ui.run(
-        host="127.0.0.1", port=port, show=False, reload=False, tailwind=False, favicon="🫁",
-        show_welcome_message=False, gzip_middleware_factory=None, ws_max_size=2**16,
-        reconnect_timeout=30,  # a page that draws slowly is not a page that has gone
-    )  # fmt: skip
+    serve(path.name, ScenePage, live, port, opened)
 
 
-class Page:
+class ScenePage(Page):
     """The widgets of one page, and the scene that they show."""
 
     def __init__(self, live: Live):
         """Nothing is built yet."""
+        super().__init__(live)
         self.live = live
-        self.phase = ""
         self.shown: object = None
-
-    def build(self) -> None:
-        """The page as it is now; it follows the work by a timer."""
-        ui.run_javascript("history.replaceState(null, '', '/')")
-        ui.query(".nicegui-content").style("padding:8px")
-        self.status = ui.label().style("font-size:16px").mark("status").props("id=status")
-        self.body = ui.row().style("width:100%;flex-wrap:nowrap;gap:12px")
-        self.timer = ui.timer(0.1, self.follow)
-        self.curve_timer = ui.timer(0.4, self.follow_curve)
-        self.follow()
-
-    def follow(self) -> None:
-        """Show the phase, and what is new since the last call."""
-        state, live = self.live.state, self.live
-        text = state.text
-        if state.phase == "ready":
-            text = live.fault
-        elif not text.startswith(state.phase):
-            text = f"{state.phase}: {text}"
-        self.status.set_text(text)
-        self.status.set_visibility(bool(text))
-        if state.phase == "ready" and self.phase != "ready":
-            with self.body:
-                self.ready()
-        self.phase = state.phase
-
-    def follow_curve(self) -> None:
-        """Draw the curve where there is a new frame; more often it would slow the view."""
-        if self.phase == "ready" and self.live.frame is not self.shown:
-            self.shown = self.live.frame
-            self.draw_curve()
 
     def ready(self) -> None:
         """What there is once the scene is compiled."""
@@ -116,19 +73,13 @@ class Page:
                  "series": [{"type": "line", "showSymbol": False, "data": []}]}
             ).style("height:210px;width:370px")  # fmt: skip
             with ui.row().style("gap:6px"):
-                ui.button("clear", on_click=self.clear).props(
-                    "dense no-caps size=sm padding='3px 8px'"
-                )
-                ui.button("CSV", on_click=self.save_curve).props(
-                    "dense no-caps size=sm padding='3px 8px'"
-                )
+                ui.button("clear", on_click=self.clear).props(SMALL)
+                ui.button("CSV", on_click=self.save_curve).props(SMALL)
                 self.recorder = ui.button("record", on_click=self.record)
-                self.recorder.props("dense no-caps size=sm padding='3px 8px' id=record")
+                self.recorder.props(f"{SMALL} id=record")
             self.widgets = [self.slider(s) for s in self.live.sliders]
             if self.live.sliders:
-                ui.button("values as TOML", on_click=self.save_values).props(
-                    "dense no-caps size=sm padding='3px 8px' id=toml"
-                )
+                ui.button("values as TOML", on_click=self.save_values).props(f"{SMALL} id=toml")
 
     def position(self) -> None:
         """Three numbers to type, and the way back to the start."""
@@ -145,10 +96,8 @@ class Page:
                 if len(typed) == 3:
                     self.wall.run_method("place", *typed)
 
-            ui.button("go", on_click=go).props("dense no-caps size=sm padding='3px 8px' id=go")
-            ui.button("reset", on_click=self.reset).props(
-                "dense no-caps size=sm padding='3px 8px' id=reset"
-            )
+            ui.button("go", on_click=go).props(f"{SMALL} id=go")
+            ui.button("reset", on_click=self.reset).props(f"{SMALL} id=reset")
 
     def slider(self, s: Any):
         """A slider over the shares 0 to 1, with the value beside it."""
@@ -180,10 +129,14 @@ class Page:
     def clear(self) -> None:
         """Begin the curve anew."""
         self.live.steps.clear()
-        self.draw_curve()
+        self.shown = None
+        self.draw()
 
-    def draw_curve(self) -> None:
-        """Force over depth of the last steps that have a force."""
+    def draw(self) -> None:
+        """Force over depth of the last steps that have a force, where there is a new one."""
+        if self.live.frame is self.shown:
+            return
+        self.shown = self.live.frame
         data = [[f.depth, float((f.force**2).sum() ** 0.5)] for f in self.live.steps[-300:]
                 if f.has_force]  # fmt: skip
         self.chart.options["series"][0]["data"] = data
@@ -193,13 +146,13 @@ class Page:
         """The steps as CSV."""
         text = io.StringIO()
         rows = csv.writer(text)
-        rows.writerow(["x_mm", "y_mm", "z_mm", "depth_mm", "force_x_N", "force_y_N", "force_z_N",
-                       "status"])  # fmt: skip
+        rows.writerow(["time_s", "x_mm", "y_mm", "z_mm", "depth_mm",
+                       "force_x_N", "force_y_N", "force_z_N", "status"])  # fmt: skip
         for f in self.live.steps:
-            numbers = [*f.pose[9:], f.depth, *f.force]
+            numbers = [f.time, *f.pose[9:], f.depth, *f.force]
             # No force is an empty cell, never a zero.
-            cells = [f"{v:.9g}" for v in (numbers if f.has_force else numbers[:3])]
-            rows.writerow([*cells, *[""] * (7 - len(cells)), f.status.name])
+            cells = [f"{v:.9g}" for v in (numbers if f.has_force else numbers[:4])]
+            rows.writerow([*cells, *[""] * (8 - len(cells)), f.status.name])
         ui.download.content(text.getvalue(), "curve.csv", "text/csv")
 
     def save_values(self) -> None:
@@ -233,7 +186,7 @@ class Page:
     def lost(self, code: object) -> None:
         """Say why the frames have stopped."""
         self.timer.deactivate()
-        self.curve_timer.deactivate()
+        self.slow_timer.deactivate()
         why = "this scene is open in another page; reload to go on here"
         if str(code) != "4409":
             why = "the connection is lost; reload, or start jaxtrachea view again"

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.config import SpecError
 from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.build import Staged, stage
 from jaxtrachea.scene.paths import path_of
@@ -17,6 +16,8 @@ from jaxtrachea.scene.stage import Poses, Scene
 
 #: The tool of a scene that has none: the last joint of a finger, across the tube.
 FINGER = {"shape": "capsule", "radius": "7 mm", "length": "10 mm"}
+#: Shortest and longest time, s, that a force which relaxes without a time of its own is made for.
+TIMES = (0.05, 1000.0)
 #: Distance of the tool from the wall where the scene gives no first position, mm.
 CLEARANCE = 3.0
 
@@ -48,7 +49,7 @@ def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> H
 
     The second plane is on, and axial motion where `EA_L` is given. The contact point is `per_step`
     without friction, so that the force depends on the pose alone. With a coefficient of friction,
-    and of a bonded tool, it is `fixed`, as docs/haptics.md has it.
+    of a bonded tool, and where the force relaxes, it is `fixed`, as docs/haptics.md has it.
 
     Args:
         path: of the scene (TOML).
@@ -58,8 +59,6 @@ def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> H
         SpecError: a file or a value that cannot be used, with its key.
     """
     spec = load_scene_spec(path)
-    if spec.names:
-        raise SpecError("tool: several tools; the page handles one: give a single [tool]")
     changed, notes = for_a_mouse(spec)
     staged = stage(changed, path.parent, lambda text: begin(text))
     if spec.tool is None:
@@ -82,8 +81,7 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
             notes.append("skeleton: linear, since a softening one is for the midline alone")
     if wanted.surface not in ("auto", "off"):
         changes["surface"] = wanted.surface
-    if spec.relaxation is not None:
-        notes.append("no relaxation: forces are those of the long run")
+    relaxes = spec.relaxation is not None and wanted.relaxation != "off"
     if spec.model.half_width > 0:
         notes.append("width: point, since half_width is for presses straight in on the midline")
     glued = spec.model.contact == "bonded"
@@ -91,18 +89,21 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
         glued = False
         notes.append("contact: unilateral, since a finger is not glued to the wall")
     rubs = _rubs(spec)
-    changes["contact_point"] = "fixed" if glued or rubs else "per_step"
+    if rubs and relaxes:
+        rubs = False
+        notes.append("no friction, since the force relaxes")
+    changes["contact_point"] = "fixed" if glued or rubs or relaxes else "per_step"
     changes["friction"] = "on" if rubs else "off"
     away = {"positions": [["0 mm", "1000 mm", "0 mm"]]}
+    legs = [away | {"duration": f"{t} s"} for t in TIMES] if relaxes else [away]
     return spec.model_copy(
         update={
             "effects": wanted.model_copy(update=changes),
             "output": spec.output.model_copy(update={"surface": True, "joints": False}),
             "model": spec.model.model_copy(update={"contact": "bonded" if glued else "unilateral"}),
             "tool": spec.tool or ToolSection.model_validate(FINGER),
-            "path": [PathSection.model_validate(away)],
+            "path": [PathSection.model_validate(leg) for leg in legs],
             "plan": None,
-            "relaxation": None,
         }
     ), tuple(notes)
 
