@@ -11,6 +11,7 @@ from small_scenes import SPRINGS
 
 from jaxtrachea.mechanics.influence_vector import STRIP, influence_vector
 from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press_contacts import press_contacts
 from jaxtrachea.mechanics.press_contacts_oblique import press_contacts_oblique
 from jaxtrachea.mechanics.ring import Ring, ring_influence
@@ -35,9 +36,8 @@ def by_program(s, phi, values, *, rings="arch2"):
 
 @functools.partial(jax.jit, static_argnames="rings")
 def press_program(s, phi, D, values, present, *, rings="arch2"):
-    options = Options(shear=True)
-    more = {"rings": rings, "present": present}
-    return press_contacts_oblique(TUBE, Material(**values), s, phi, D, options, **more)
+    options = ObliqueOptions(Options(shear=True), rings)
+    return press_contacts_oblique(TUBE, Material(**values), s, phi, D, options, present=present)
 
 
 def responses(*given, **more):
@@ -96,7 +96,7 @@ def test_opposite_and_equal_meridians_against_finite_elements(rings):
     size = got.compliance.max()
     for i, j in ((0, 1), (1, 0), (2, 0)):
         w, line = by_elements(s[[i, j]], phi[[i, j]], rings)
-        np.testing.assert_allclose(got.contacts[j, i, 1:], w, rtol=0, atol=1e-12 * size)
+        np.testing.assert_allclose(got.contacts[j, i, i, 1:], w, rtol=0, atol=1e-12 * size)
         np.testing.assert_allclose(got.joints[j, i, :, 1:], line, rtol=0, atol=1e-11 * size)
     ring, F = _ring(rings), frame(1.5)
     line = strip(F @ ring(1.5, 1.5) @ F.T, s[2], 1.0)["w"]
@@ -140,9 +140,10 @@ def test_one_contact_is_the_skeleton_of_one():
         TUBE, material, s, phi, **more))(73.0, -1.4))  # fmt: skip
     got = responses(np.array([73.0, 80.0, 96.5]), np.array([-1.4, 1.5, 1.5]), VALUES)
     inward = np.array([0, -np.cos(1.4), np.sin(1.4)])
-    for name, other in (("contacts", "compliance"), ("turns", "slope_C"), ("joints", "joints"),
-                        ("slopes", "slopes")):  # fmt: skip
-        v = getattr(one, other) @ inward
+    np.testing.assert_allclose(got.contacts[0, 0, 0], one.compliance @ inward, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(got.turns[0, 0, 0], one.slope_C @ inward, rtol=0, atol=1e-12)
+    for name in ("joints", "slopes"):
+        v = getattr(one, name) @ inward
         np.testing.assert_allclose(getattr(got, name)[0, 0], v, rtol=0, atol=1e-12)
     for name in ("loads", "end_U", "end_V"):
         v = getattr(one, name) @ inward
@@ -250,11 +251,11 @@ def test_absent_and_refused_contacts():
 def test_what_is_not_derived():
     for options, rings, says in (
         (Options(contact="bonded"), "mat", "found 'bonded': a tool that is glued"),
-        (Options(half_width=1.0), "mat", "needs half_width=0, found 1"),
         (Options(), "arch", "needs rings='arch2' or 'mat'"),
         (Options(coupling="total"), "mat", "press_contacts_oblique needs coupling='series'"),
     ):
         with pytest.raises(ValueError, match=says):
-            press_contacts_oblique(TUBE, Material(**VALUES), S, PHI, ROWS, options, rings=rings)
+            options = ObliqueOptions(options, rings)
+            press_contacts_oblique(TUBE, Material(**VALUES), S, PHI, ROWS, options)
     with pytest.raises(ValueError, match="EI_C"):
         press_contacts_oblique(TUBE, SPRINGS, S, PHI, ROWS)
