@@ -21,6 +21,8 @@ from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
 pytestmark = pytest.mark.compiling
+#: All but the refusals share programs that take ten seconds each to compile.
+slow = pytest.mark.slow
 
 VALUES = {"EI_L": 1.9, "EI_side": 2.4, "GA_L": 9.0, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02,
           "EI_C": 9.9, "k_t": 0.03}  # fmt: skip
@@ -88,6 +90,7 @@ def by_elements(s, phi, rings):
     return found["w_C"] @ F[0], found["w"] @ F[0]
 
 
+@slow
 @pytest.mark.parametrize("rings", ["mat", "arch2"])
 def test_opposite_and_equal_meridians_against_finite_elements(rings):
     """Both loads, each at the other's place; on one meridian on one strip."""
@@ -118,6 +121,7 @@ def fields(C, at, fine):
     return P, V, M - turn / LENGTH
 
 
+@slow
 def test_a_part_of_two_strips_in_common_by_their_moments():
     """Rings, and kappa times the energy of what both strips bear, all from exact elements."""
     s, phi, ring = np.array([73.0, 77.0, 120.0]), np.array([0.3, 0.4, -1.5]), _ring("arch2")
@@ -133,6 +137,7 @@ def test_a_part_of_two_strips_in_common_by_their_moments():
     np.testing.assert_allclose(C[0, 1], by_rings + kappa * shared, rtol=0, atol=1e-11 * C.max())
 
 
+@slow
 def test_one_contact_is_the_skeleton_of_one():
     material = Material(**VALUES)
     more = {"axial": False, "shear": True}
@@ -150,6 +155,7 @@ def test_one_contact_is_the_skeleton_of_one():
         np.testing.assert_allclose(getattr(got, name)[0], v, rtol=0, atol=1e-12)
 
 
+@slow
 def test_continuous_across_equal_meridians_and_the_ends_of_a_strip():
     """The largest step over 1e-4 rad is below 1e-3 of C."""
     for middle in (0.4, 0.4 + STRIP, 0.4 - STRIP):
@@ -162,7 +168,7 @@ def test_continuous_across_equal_meridians_and_the_ends_of_a_strip():
         assert np.abs(np.diff(C, axis=0)).max() < 1e-3 * np.abs(C).max()
 
 
-@pytest.mark.slow
+@slow
 def test_compliances_are_positive_semi_definite():
     """10,000 random sets, a third of them with contacts close to each other or on one place."""
     rng = np.random.default_rng(5)
@@ -192,6 +198,7 @@ ALL = np.ones(3, bool)
 ROWS = np.array([[2.0, 3.0, -0.05], [2.0, 3.0, 1.0], [1.0, 0.1, 4.0]])
 
 
+@slow
 def test_a_pinch_brings_the_wall_against_a_tool_in_front():
     """Ring and strip balance the laws, and the front bulges towards the third tool."""
     found = pressed(S, PHI, ROWS, VALUES, ALL)
@@ -210,6 +217,7 @@ def test_a_pinch_brings_the_wall_against_a_tool_in_front():
     assert np.abs(rest).max() < 0.05 * F.max()  # what the clamps bear
 
 
+@slow
 def test_the_order_of_tools_does_not_matter():
     order = np.array([2, 0, 1])
     a = pressed(S, PHI, ROWS, VALUES, ALL)
@@ -219,6 +227,7 @@ def test_the_order_of_tools_does_not_matter():
     np.testing.assert_allclose(b.end_U, a.end_U, rtol=0, atol=1e-12)
 
 
+@slow
 def test_on_the_midline_it_is_press_contacts():
     D = np.array([[3.0, 1.0, 4.0], [4.0, 0.5, 0.1], [-1.0, 2.0, 0.0]])
     got = pressed(S, 0 * PHI, D, VALUES, ALL, rings="mat")
@@ -231,6 +240,7 @@ def test_on_the_midline_it_is_press_contacts():
     assert LIFTED in got.status
 
 
+@slow
 def test_absent_and_refused_contacts():
     there = np.array([True, False, True])
     got = pressed(np.array([75.0, 900.0, 73.0]), np.array([-1.5, 3.0, 0.0]), ROWS, VALUES, there)
@@ -249,13 +259,12 @@ def test_absent_and_refused_contacts():
 
 
 def test_what_is_not_derived():
-    for options, rings, says in (
-        (Options(contact="bonded"), "mat", "found 'bonded': a tool that is glued"),
-        (Options(), "arch", "needs rings='arch2' or 'mat'"),
-        (Options(coupling="total"), "mat", "press_contacts_oblique needs coupling='series'"),
+    for options, says in (
+        (ObliqueOptions(Options(contact="bonded")), "found 'bonded': a tool that is glued"),
+        (ObliqueOptions(rings="arch"), "needs rings='arch2' or 'mat'"),
+        (ObliqueOptions(Options(coupling="total")), "press_contacts_oblique needs coupling"),
     ):
         with pytest.raises(ValueError, match=says):
-            options = ObliqueOptions(options, rings)
             press_contacts_oblique(TUBE, Material(**VALUES), S, PHI, ROWS, options)
     with pytest.raises(ValueError, match="EI_C"):
         press_contacts_oblique(TUBE, SPRINGS, S, PHI, ROWS)

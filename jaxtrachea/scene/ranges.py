@@ -52,9 +52,10 @@ def outside_plan(
     """Rows that press and need an effect that is off.
 
     Off the midline or oblique without vectors, along the tube without stretch (of several tools:
-    a drag along the wall), along the surface without friction, deep without a skeleton that softens, elsewhere or too far for one contact
-    point, near a surface without a dent; or anywhere with a material that bends, shears, lets the
-    ends move or has rings of their own where the plan did not.
+    dragging the wall along), along the surface without friction, deep without a skeleton that
+    softens, elsewhere or too far for one contact point, near a surface without a dent; or anywhere
+    with a material that bends, shears, lets the ends move or has rings of their own where the plan
+    did not.
 
     Args:
         scene: -
