@@ -7,7 +7,7 @@ sum of what each line does by itself, so that `regions.interpolate` serves each 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrachea._numerics import added, epsilon
+from jaxtrachea._numerics import added, epsilon, product
 from jaxtrachea.surface.regions import Binding, Weights, line_shares, weigh
 
 
@@ -15,8 +15,9 @@ def weigh_lines(binding: Binding, phi: Float[Array, " m"]) -> list[Weights]:
     """The weights of every line; U and V belong to the first of them.
 
     The share of a line is a sum of what it would be of each line between U and V alone, 1 on its
-    own meridian and 0 on those of the others. Lines on one meridian share it; a ridge of 16 eps m
-    keeps that solvable.
+    own meridian and 0 on those of the others. Lines on one meridian share it: a ridge of sqrt(eps)
+    keeps that solvable, and a step of refinement leaves the rest to rounding. As far as such lines
+    are one they are met to sqrt(eps) of their motion.
 
     Args:
         binding: from `regions.bind`.
@@ -25,8 +26,9 @@ def weigh_lines(binding: Binding, phi: Float[Array, " m"]) -> list[Weights]:
     m, alpha = phi.shape[0], binding.half_angle
     alone = [weigh(binding, phi[k]) for k in range(m)]
     peaks = jnp.stack([line_shares(phi, phi[k], alpha)[1] for k in range(m)], axis=1)
-    ridge = 16 * m * epsilon(phi.dtype)
-    parts = jnp.linalg.inv(peaks + ridge * jnp.eye(m, dtype=phi.dtype))
+    one = jnp.eye(m, dtype=phi.dtype)
+    parts = jnp.linalg.inv(peaks + epsilon(phi.dtype) ** 0.5 * one)
+    parts = product(parts, 2 * one - product(peaks, parts))
     lines = [added([alone[k].J * parts[k, i] for k in range(m)]) for i in range(m)]
     # U and V, linear between them, less what the lines take.
     at = (alpha - phi) / (2 * alpha)
