@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from small_scenes import BALL, BARE, MATERIAL, SPRINGS, TUBE, ball, presses
+from small_scenes import BALL, BARE, MATERIAL, OUTER, SPRINGS, TUBE, ball, poses, presses
 
 from jaxtrachea import (
     EffectOptions,
@@ -337,6 +337,26 @@ def test_files_of_a_pinch(tmp_path):
     read = read_simulation(tmp_path / "simulation.h5").simulation
     np.testing.assert_array_equal(read.joints, out.joints)
     np.testing.assert_array_equal(of_tool(out, 1).joints, out.joints[:, 1])
+
+
+@pytest.mark.slow
+def test_a_session_pinches_as_a_path_does():
+    """Balls at both sides; one that is lifted away leaves the others."""
+    out = OUTER + 5
+    paths = {
+        "left": poses([75, 0, out + 0.5], [75, 0, out - 2.5]),
+        "right": poses([77, 0, -out - 0.2], [77, 0, -out + 2]),
+    }
+    scene = make_scene(TUBE, MATERIAL, paths, tool=dict.fromkeys(paths, BALL), effects=BARE)
+    true = jax.device_get(simulate(scene, MATERIAL, paths))
+    session = Session(scene, MATERIAL)
+    for row in range(4):
+        found = session.step({n: (p.rotation[row], p.translation[row]) for n, p in paths.items()})
+        np.testing.assert_allclose(found.force, true.force[row], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(found.joints, true.joints[row], rtol=0, atol=1e-13)
+    lifted = session.step({}, present={"right": False})
+    assert lifted.status.tolist() == [OK, NO_CONTACT]
+    assert np.linalg.norm(lifted.force[0]) < 0.7 * np.linalg.norm(true.force[-1, 0])
 
 
 @pytest.mark.slow
