@@ -32,6 +32,8 @@ from .mechanics.press import Press as Press
 from .mechanics.press import press as press
 from .mechanics.press_contacts import Contacts as Contacts
 from .mechanics.press_contacts import press_contacts as press_contacts
+from .mechanics.press_contacts_oblique import ObliqueContacts as ObliqueContacts
+from .mechanics.press_contacts_oblique import press_contacts_oblique as press_contacts_oblique
 from .mechanics.press_in_time import press_in_time as press_in_time
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea._arguments import ArrayLike, last_axis, shaped
 from jaxtrachea._numerics import product_of_rows
 from jaxtrachea.mechanics.contacts import solve
+from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.influence import influence, level_influence
 from jaxtrachea.mechanics.levels.options import Options, check_line
 from jaxtrachea.mechanics.press import ligament_beam, local_law, read_values
@@ -92,7 +93,32 @@ def press_contacts(
             contact alone has, and as `press`.
     """
     check_shapes(geometry, material)
-    _check_options(options)
+    check_contact_options(options, "press_contacts")
+    asked = checked_contacts(geometry, s_c, displacement, onset, present)
+    return _press_contacts(geometry, material, options, asked)
+
+
+class Asked(NamedTuple):
+    """What several contacts are asked, as arrays; as the arguments of `press_contacts`."""
+
+    s_c: Float[Array, " m"]
+    displacement: Float[Array, "*n m"]
+    onset: Float[Array, " m"]
+    present: Bool[Array, " m"]
+
+
+def checked_contacts(
+    geometry: Geometry,
+    s_c: ArrayLike,
+    displacement: ArrayLike,
+    onset: ArrayLike | None,
+    present: ArrayLike | None,
+) -> Asked:
+    """The arguments of several contacts as arrays.
+
+    Raises:
+        ValueError: too many contacts, or arrays that do not fit their number.
+    """
     dtype = float_type(geometry)
     s_c = shaped("s_c", s_c, ("any number of",), dtype=dtype)
     m = s_c.shape[0]
@@ -105,64 +131,44 @@ def press_contacts(
         raise ValueError(
             f"present has shape {there.shape} of {there.dtype}; expected ({m},) of True and False"
         )
-    there = jnp.broadcast_to(there, (m,))
-    return _press_contacts(geometry, material, s_c, displacement, options, onset, there)
+    return Asked(s_c, displacement, onset, jnp.broadcast_to(there, (m,)))
 
 
-def _check_options(options: Options) -> None:
+def check_contact_options(options: Options, name: str) -> None:
     """Refuse what is derived for one contact alone.
 
     Raises:
         ValueError: naming the option and the cure.
     """
-    check_line(options, "press_contacts")
+    check_line(options, name)
     why = {
         "coupling": ("series", "contacts do not feel one another with it; press each by itself"),
         "skeleton": ("linear", "its softening is that of one contact; press each by itself"),
         "split": ("continuous", "the paper's split has no motion of one contact by another"),
         "form": ("recursion", "it has the same answer"),
     }
-    for name, (only, reason) in why.items():
-        if (value := getattr(options, name)) != only:
-            raise ValueError(f"press_contacts needs {name}={only!r}, found {value!r}: {reason}")
+    for field, (only, reason) in why.items():
+        if (value := getattr(options, field)) != only:
+            raise ValueError(f"{name} needs {field}={only!r}, found {value!r}: {reason}")
 
 
 @functools.partial(jax.jit, static_argnames="options", inline=True)
 def _press_contacts(
     geometry: Geometry,
     material: Material,
-    s_c: Float[Array, " m"],
-    displacement: Float[Array, "*n m"],
     options: Options,
-    onset: Float[Array, " m"],
-    present: Bool[Array, " m"],
+    asked: Asked,
 ) -> Contacts:
     """`press_contacts`, of arguments that are checked."""
     used, half = read_values(options), options.half_width
-    s_c = jnp.where(present, s_c, geometry.length / 2)
-    onset = jnp.where(present, onset, 0)
+    s_c = jnp.where(asked.present, asked.s_c, geometry.length / 2)
     s_c, refused = jax.vmap(lambda s: validate(geometry, material, s, used, reach=half)[1:])(s_c)
     material = validate(geometry, material, s_c[0], used).material
     refused = jnp.max(refused)
     beam = ligament_beam(geometry, material, options)
     unit = influence(beam, s_c) if half == 0 else level_influence(beam, s_c, half)
     law = jax.vmap(lambda s: local_law(geometry, material, s, options))(s_c)
-    # The loop of `solve` keeps its dtype: float32 arguments meet a float64 tube here.
-    dtype = jnp.result_type(displacement, unit.compliance, *jax.tree.leaves(law))
-    displacement = displacement.astype(dtype)
-    width = None
-    if options.contact == "unilateral":
-        width = jnp.asarray(options.onset_width, displacement.dtype)
-
-    def row(D):
-        return solve(D - onset, unit.compliance, law, width=width, present=present)
-
-    solved = jax.vmap(row)(displacement.reshape(-1, displacement.shape[-1]))
-    force, depth, status = (
-        v.reshape(displacement.shape) for v in (solved.force, solved.depth, solved.status)
-    )
-    moved = displacement - jnp.broadcast_to(onset, displacement.shape).astype(displacement.dtype)
-    status = mark_deep(status, moved, geometry.radius)
+    force, depth, status = solve_rows(asked, unit.compliance, law, options, geometry.radius)
     unit, force, depth = mask(refused, unit, force, depth)
     return Contacts(
         force=force,
@@ -173,3 +179,30 @@ def _press_contacts(
         compliance=unit.compliance,
         status=status_of(refused, status),
     )
+
+
+def solve_rows(
+    asked: Asked,
+    compliance: Float[Array, "m m"],
+    law: Law,
+    options: Options,
+    radius: Float[Array, ""],
+) -> tuple[Float[Array, "*n m"], Float[Array, "*n m"], Int[Array, "*n m"]]:
+    """Forces, N, local indentations, mm, and statuses of contacts on a skeleton that is known."""
+    # The loop of `solve` keeps its dtype: float32 arguments meet a float64 tube here.
+    dtype = jnp.result_type(asked.displacement, compliance, *jax.tree.leaves(law))
+    displacement = asked.displacement.astype(dtype)
+    onset = jnp.where(asked.present, asked.onset, 0)
+    width = None
+    if options.contact == "unilateral":
+        width = jnp.asarray(options.onset_width, displacement.dtype)
+
+    def row(D):
+        return solve(D - onset, compliance, law, width=width, present=asked.present)
+
+    solved = jax.vmap(row)(displacement.reshape(-1, displacement.shape[-1]))
+    force, depth, status = (
+        v.reshape(displacement.shape) for v in (solved.force, solved.depth, solved.status)
+    )
+    moved = displacement - jnp.broadcast_to(onset, displacement.shape).astype(displacement.dtype)
+    return force, depth, mark_deep(status, moved, radius)

@@ -138,8 +138,8 @@ def respond(
     C, per_load, status = _rings(geometry, material, phi_c, rings)
     x = geometry.ring_positions
     n = x.shape[0]
-    EI = _planes(material.EI_L, material.EI_side, n + 1)
-    GA = _planes(_needed(material, "GA_L", "shear"), material.GA_side, n + 1) if shear else None
+    EI = planes(material.EI_L, material.EI_side, n + 1)
+    GA = planes(needed(material, "GA_L", "shear"), material.GA_side, n + 1) if shear else None
     beam = spatial_beam.SpatialBeam(x, geometry.length, EI, turned(C, frame.T), GA)
     unit = jax.vmap(spatial_beam.deflect, (None, None, 0), -1)(beam, s_c, jnp.eye(2, dtype=x.dtype))
 
@@ -147,7 +147,7 @@ def respond(
     w_C, w, P = (turned(v, frame) for v in (unit.w_C, unit.w, unit.reaction))
     along = None
     if axial:
-        EA = jnp.broadcast_to(_needed(material, "EA_L", "axial"), (n + 1,))
+        EA = jnp.broadcast_to(needed(material, "EA_L", "axial"), (n + 1,))
         ends = {"k_A": material.k_A, "k_B": material.k_B}
         along = _axial.stretch(x, geometry.length, EA, s_c, jnp.ones_like(s_c), **ends)
     u_C, u, passed = jnp.zeros_like(s_c), jnp.zeros_like(x), jnp.zeros_like(x)
@@ -169,14 +169,19 @@ def respond(
     )
 
 
-def _needed(material: Material, name: str, option: str):
+def needed(material: Material, name: str, option: str) -> Array:
+    """A value of the material.
+
+    Raises:
+        ValueError: it is None; naming the option that needs it.
+    """
     value = getattr(material, name)
     if value is None:
         raise ValueError(f"{option} needs Material.{name}; it is None")
     return value
 
 
-def _planes(normal, side, spans):
+def planes(normal, side, spans: int) -> Float[Array, "spans 2"]:
     """Stiffness of each span in the planes of the normal and of the circumference."""
     pair = (normal, normal if side is None else side)
     return jnp.stack([jnp.broadcast_to(v, (spans,)) for v in pair], 1)
@@ -199,7 +204,7 @@ def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
         off = jnp.where(jnp.isnan(phi_c), RingStatus.NON_FINITE, RingStatus.BEHIND_GAP)
         status = jnp.where(on, RingStatus.OK, off).astype(jnp.int8)
         return eye / jnp.where(on, k_M, jnp.nan)[:, None, None], None, status
-    EI, k_t = (_needed(material, name, f"rings={level!r}") for name in ("EI_C", "k_t"))
+    EI, k_t = (needed(material, name, f"rings={level!r}") for name in ("EI_C", "k_t"))
 
     def one(k):
         ring = _ring.Ring(geometry.radius, geometry.half_angle, EI, k, k_t)

@@ -23,6 +23,7 @@ from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.press_contacts import press_contacts
+from jaxtrachea.mechanics.press_contacts_oblique import press_contacts_oblique
 from jaxtrachea.mechanics.skeleton import skeleton_response
 from jaxtrachea.mechanics.vector_equilibrium import press_vector
 from jaxtrachea.trachea.geometry import Geometry
@@ -110,6 +111,11 @@ def several(**options):
     return call
 
 
+def _pinched(v):
+    found = press_contacts_oblique(_tube(v), _material(v), v["s"], v["phi"], v["D"])
+    return found.force, found.depth, found.joints, found.loads, found.end_V, found.compliance
+
+
 def _oblique(v):
     found = press_oblique(_tube(v), _material(v), v["s"], v["phi"], v["D"])
     return found.force, found.depth, found.joints
@@ -147,6 +153,8 @@ OBLIQUE = TUBE | VALUES | RING | {"s": 26.7, "phi": 0.3, "D": np.array([0.1, -1.
 CONTACTS = PRESS | {
     "s": np.array([26.7, 44.0, 20.0]), "D": np.array([[0.3, 1.1, 2.5], [2.5, 0.6, 0.1]]),
 }  # fmt: skip
+#: Two share a part of their strips, the third is opposite.
+PINCH = CONTACTS | RING | {"phi": np.array([0.1, 0.22, -0.9])}
 SOFT = {"k_3": -1e4}
 OFF = {"s": 400.0}
 
@@ -200,6 +208,10 @@ ROWS = {
         several(), CONTACTS, {"s": np.array([26.7, 400.0, 20.0])},
         (changed(several(), r"displacement has 2 values; expected shape", D=np.ones(2)),),
     ),
+    "press_contacts_oblique": Row(
+        _pinched, PINCH, {"phi": np.array([0.1, 2.2, -0.9])},
+        (changed(_pinched, r"phi_c has 2 values; expected 3 values", phi=np.ones(2)),),
+    ),
     "press_oblique": Row(
         _oblique, OBLIQUE, OFF,
         (changed(_oblique, SAYS, **LONG),),
@@ -223,6 +235,7 @@ SLOW = (
     "skeleton_response",
     "press, softening",
     "press, two materials",
+    "press_contacts_oblique",
 )
 #: A path has an oblique press in it.
 EACH = [
