@@ -38,6 +38,7 @@ SHOWS = {
     "no_surface": {"surface": "off", "joints": "off", "second_plane": "off"},
     "normal": {"axial": "off", "rings": "arch2"},
     "off_midline": {"contact": "on", "second_plane": "on", "rings": "arch2"},
+    "pinch": {"tools": "coupled", "rings": "arch2", "contact": "on"},
     "relaxation": {"relaxation": "uniform", "contact": "on", "contact_point": "fixed"},
     "retractor": {"tools": "coupled", "contact": "on"},
     "right_down": {"axial": "on", "rings": "arch2"},

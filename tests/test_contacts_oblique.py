@@ -11,6 +11,7 @@ from small_scenes import SPRINGS
 
 from jaxtrachea.mechanics.influence_vector import STRIP, influence_vector
 from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press_contacts import press_contacts
 from jaxtrachea.mechanics.press_contacts_oblique import press_contacts_oblique
 from jaxtrachea.mechanics.ring import Ring, ring_influence
@@ -20,6 +21,8 @@ from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
 pytestmark = pytest.mark.compiling
+#: All but the refusals share programs that take ten seconds each to compile.
+slow = pytest.mark.slow
 
 VALUES = {"EI_L": 1.9, "EI_side": 2.4, "GA_L": 9.0, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02,
           "EI_C": 9.9, "k_t": 0.03}  # fmt: skip
@@ -35,9 +38,8 @@ def by_program(s, phi, values, *, rings="arch2"):
 
 @functools.partial(jax.jit, static_argnames="rings")
 def press_program(s, phi, D, values, present, *, rings="arch2"):
-    options = Options(shear=True)
-    more = {"rings": rings, "present": present}
-    return press_contacts_oblique(TUBE, Material(**values), s, phi, D, options, **more)
+    options = ObliqueOptions(Options(shear=True), rings)
+    return press_contacts_oblique(TUBE, Material(**values), s, phi, D, options, present=present)
 
 
 def responses(*given, **more):
@@ -88,6 +90,7 @@ def by_elements(s, phi, rings):
     return found["w_C"] @ F[0], found["w"] @ F[0]
 
 
+@slow
 @pytest.mark.parametrize("rings", ["mat", "arch2"])
 def test_opposite_and_equal_meridians_against_finite_elements(rings):
     """Both loads, each at the other's place; on one meridian on one strip."""
@@ -96,7 +99,7 @@ def test_opposite_and_equal_meridians_against_finite_elements(rings):
     size = got.compliance.max()
     for i, j in ((0, 1), (1, 0), (2, 0)):
         w, line = by_elements(s[[i, j]], phi[[i, j]], rings)
-        np.testing.assert_allclose(got.contacts[j, i, 1:], w, rtol=0, atol=1e-12 * size)
+        np.testing.assert_allclose(got.contacts[j, i, i, 1:], w, rtol=0, atol=1e-12 * size)
         np.testing.assert_allclose(got.joints[j, i, :, 1:], line, rtol=0, atol=1e-11 * size)
     ring, F = _ring(rings), frame(1.5)
     line = strip(F @ ring(1.5, 1.5) @ F.T, s[2], 1.0)["w"]
@@ -118,6 +121,7 @@ def fields(C, at, fine):
     return P, V, M - turn / LENGTH
 
 
+@slow
 def test_a_part_of_two_strips_in_common_by_their_moments():
     """Rings, and kappa times the energy of what both strips bear, all from exact elements."""
     s, phi, ring = np.array([73.0, 77.0, 120.0]), np.array([0.3, 0.4, -1.5]), _ring("arch2")
@@ -133,6 +137,7 @@ def test_a_part_of_two_strips_in_common_by_their_moments():
     np.testing.assert_allclose(C[0, 1], by_rings + kappa * shared, rtol=0, atol=1e-11 * C.max())
 
 
+@slow
 def test_one_contact_is_the_skeleton_of_one():
     material = Material(**VALUES)
     more = {"axial": False, "shear": True}
@@ -140,15 +145,17 @@ def test_one_contact_is_the_skeleton_of_one():
         TUBE, material, s, phi, **more))(73.0, -1.4))  # fmt: skip
     got = responses(np.array([73.0, 80.0, 96.5]), np.array([-1.4, 1.5, 1.5]), VALUES)
     inward = np.array([0, -np.cos(1.4), np.sin(1.4)])
-    for name, other in (("contacts", "compliance"), ("turns", "slope_C"), ("joints", "joints"),
-                        ("slopes", "slopes")):  # fmt: skip
-        v = getattr(one, other) @ inward
+    np.testing.assert_allclose(got.contacts[0, 0, 0], one.compliance @ inward, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(got.turns[0, 0, 0], one.slope_C @ inward, rtol=0, atol=1e-12)
+    for name in ("joints", "slopes"):
+        v = getattr(one, name) @ inward
         np.testing.assert_allclose(getattr(got, name)[0, 0], v, rtol=0, atol=1e-12)
     for name in ("loads", "end_U", "end_V"):
         v = getattr(one, name) @ inward
         np.testing.assert_allclose(getattr(got, name)[0], v, rtol=0, atol=1e-12)
 
 
+@slow
 def test_continuous_across_equal_meridians_and_the_ends_of_a_strip():
     """The largest step over 1e-4 rad is below 1e-3 of C."""
     for middle in (0.4, 0.4 + STRIP, 0.4 - STRIP):
@@ -161,7 +168,7 @@ def test_continuous_across_equal_meridians_and_the_ends_of_a_strip():
         assert np.abs(np.diff(C, axis=0)).max() < 1e-3 * np.abs(C).max()
 
 
-@pytest.mark.slow
+@slow
 def test_compliances_are_positive_semi_definite():
     """10,000 random sets, a third of them with contacts close to each other or on one place."""
     rng = np.random.default_rng(5)
@@ -191,6 +198,7 @@ ALL = np.ones(3, bool)
 ROWS = np.array([[2.0, 3.0, -0.05], [2.0, 3.0, 1.0], [1.0, 0.1, 4.0]])
 
 
+@slow
 def test_a_pinch_brings_the_wall_against_a_tool_in_front():
     """Ring and strip balance the laws, and the front bulges towards the third tool."""
     found = pressed(S, PHI, ROWS, VALUES, ALL)
@@ -209,6 +217,7 @@ def test_a_pinch_brings_the_wall_against_a_tool_in_front():
     assert np.abs(rest).max() < 0.05 * F.max()  # what the clamps bear
 
 
+@slow
 def test_the_order_of_tools_does_not_matter():
     order = np.array([2, 0, 1])
     a = pressed(S, PHI, ROWS, VALUES, ALL)
@@ -218,6 +227,7 @@ def test_the_order_of_tools_does_not_matter():
     np.testing.assert_allclose(b.end_U, a.end_U, rtol=0, atol=1e-12)
 
 
+@slow
 def test_on_the_midline_it_is_press_contacts():
     D = np.array([[3.0, 1.0, 4.0], [4.0, 0.5, 0.1], [-1.0, 2.0, 0.0]])
     got = pressed(S, 0 * PHI, D, VALUES, ALL, rings="mat")
@@ -230,6 +240,7 @@ def test_on_the_midline_it_is_press_contacts():
     assert LIFTED in got.status
 
 
+@slow
 def test_absent_and_refused_contacts():
     there = np.array([True, False, True])
     got = pressed(np.array([75.0, 900.0, 73.0]), np.array([-1.5, 3.0, 0.0]), ROWS, VALUES, there)
@@ -248,13 +259,12 @@ def test_absent_and_refused_contacts():
 
 
 def test_what_is_not_derived():
-    for options, rings, says in (
-        (Options(contact="bonded"), "mat", "found 'bonded': a tool that is glued"),
-        (Options(half_width=1.0), "mat", "needs half_width=0, found 1"),
-        (Options(), "arch", "needs rings='arch2' or 'mat'"),
-        (Options(coupling="total"), "mat", "press_contacts_oblique needs coupling='series'"),
+    for options, says in (
+        (ObliqueOptions(Options(contact="bonded")), "found 'bonded': a tool that is glued"),
+        (ObliqueOptions(rings="arch"), "needs rings='arch2' or 'mat'"),
+        (ObliqueOptions(Options(coupling="total")), "press_contacts_oblique needs coupling"),
     ):
         with pytest.raises(ValueError, match=says):
-            press_contacts_oblique(TUBE, Material(**VALUES), S, PHI, ROWS, options, rings=rings)
+            press_contacts_oblique(TUBE, Material(**VALUES), S, PHI, ROWS, options)
     with pytest.raises(ValueError, match="EI_C"):
         press_contacts_oblique(TUBE, SPRINGS, S, PHI, ROWS)

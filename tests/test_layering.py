@@ -55,7 +55,7 @@ WITHIN = {
         {"landing", "lumen", "ranges", "trail", "paths", "instruments"},
         {"approach"},
         {"facts", "refusals", "deform", "programs", "overlap"},
-        {"configurational", "dents"},
+        {"configurational", "dents", "lines"},
         {"together"},
         {"assemble", "simulation", "sweep", "anchor"},
         {"held_force", "one_row", "grip"},

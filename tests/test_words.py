@@ -151,6 +151,7 @@ INNER = {
     "mechanics.beam.deflect_on",
     "mechanics.skeleton.respond", "mechanics.skeleton.read_values",
     "mechanics.energy.gradient", "mechanics.skeleton.turned_rings", "fitting.noise.normal_psi2",
+    "scene.lines.interpolate",
 }  # fmt: skip
 
 

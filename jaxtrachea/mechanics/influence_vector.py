@@ -46,8 +46,9 @@ class VectorInfluence(NamedTuple):
     Attributes:
         compliance: inward motion of contact i per unit force at contact j, mm/N; symmetric and
             positive semi-definite; shape (m, m).
-        contacts: displacement of each contact, mm/N; shape (m, m, 3).
-        turns: rotation of its ligament there in y and z, rad/N; shape (m, m, 2).
+        contacts: displacement of each meridian's ligament at the places of all contacts, mm/N;
+            shape (m, m, m, 3). Contact i is place i on meridian i.
+        turns: its rotation there in y and z, rad/N; shape (m, m, m, 2).
         joints: displacement of the ligament at each ring, mm/N; shape (m, m, rings, 3).
         slopes: its rotation there, rad/N; shape (m, m, rings, 2).
         loads: load of the force's own strip on each ring; shape (m, rings, 3).
@@ -56,8 +57,8 @@ class VectorInfluence(NamedTuple):
     """
 
     compliance: Float[Array, "m m"]
-    contacts: Float[Array, "m m 3"]
-    turns: Float[Array, "m m 2"]
+    contacts: Float[Array, "m m m 3"]
+    turns: Float[Array, "m m m 2"]
     joints: Float[Array, "m m rings 3"]
     slopes: Float[Array, "m m rings 2"]
     loads: Float[Array, "m rings 3"]
@@ -107,15 +108,21 @@ def influence_vector(
         """From the frames of the meridians to y and z, with the axis of the force first."""
         return _einsum("ij...p,ipy->ji...y", v, frames)
 
-    contacts = tube(jnp.concatenate([compliance[..., None], C[..., 1:]], -1))
-    turns = jnp.stack([theta[i, :, n + i] for i in range(s.shape[0])])
+    C = jnp.concatenate([compliance[..., None], C[..., 1:]], -1)
+    itself = jnp.eye(s.shape[0], dtype=bool)[:, None, :, None]
+    contacts = tube(jnp.where(itself, C[:, :, None], u[:, :, n:]))
     P = _einsum("jrp,jpy->jry", strips.P[..., 0], frames)
     U, V = (_widen(_einsum("jryz,jrz->jry", end, P)) for end in ends)
     return VectorInfluence(
-        compliance=compliance, contacts=_widen(contacts), turns=tube(turns),
+        compliance=compliance, contacts=_widen(contacts), turns=tube(theta[:, :, n:]),
         joints=_widen(tube(u[:, :, :n])), slopes=tube(theta[:, :, :n]), loads=_widen(P),
         end_U=U, end_V=V,
     )  # fmt: skip
+
+
+def own_contacts(unit: VectorInfluence) -> Float[Array, "m m 3"]:
+    """Displacement of every contact, each on its own meridian, per unit force, mm/N."""
+    return jnp.stack([unit.contacts[:, i, i] for i in range(unit.contacts.shape[0])], axis=1)
 
 
 def _einsum(*given):

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import product_of_rows, scaled
 from jaxtrachea.mechanics import skeleton
-from jaxtrachea.mechanics.influence_vector import influence_vector
+from jaxtrachea.mechanics.influence_vector import influence_vector, own_contacts
 from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import local_law, read_values
 from jaxtrachea.mechanics.press_contacts import (
     Asked,
@@ -62,9 +63,8 @@ def press_contacts_oblique(
     s_c: ArrayLike,
     phi_c: ArrayLike,
     displacement: ArrayLike,
-    options: Options = Options(),
+    options: ObliqueOptions = ObliqueOptions(),
     *,
-    rings: Rings = "arch2",
     onset: ArrayLike | None = None,
     present: ArrayLike | None = None,
 ) -> ObliqueContacts:
@@ -85,10 +85,9 @@ def press_contacts_oblique(
             Derivatives have a kink where two are equal.
         displacement: of each tool along its inward normal, mm; shape (*n, m). Negative: the tool
             is that far from the wall at rest.
-        options: what is modelled (static), as for `press_contacts`; `unilateral` and without a
-            width.
-        rings: `mat`: every ring moves on k_M without bending; `arch2`: it bends, see
-            `skeleton_response`.
+        options: what is modelled (static): `press` as for `press_contacts`, `unilateral` and
+            without a width; `rings` `arch2`, or `mat`, on which every ring moves without bending.
+            `axial` is not read: no force is along the tube.
         onset: displacement of each tool at first touch, mm; shape (m,). 0 if None.
         present: which tools are there; shape (m,). All if None. See `press_contacts`.
 
@@ -101,11 +100,11 @@ def press_contacts_oblique(
             value of the material, and as `press_contacts`.
     """
     check_shapes(geometry, material)
-    check_word("rings", rings, Rings)
-    _check_oblique(options, rings)
+    check_word("options", options, ObliqueOptions)
+    _check_oblique(options.press, options.rings)
     asked = checked_contacts(geometry, s_c, displacement, onset, present)
     phi_c = shaped("phi_c", phi_c, asked.s_c.shape, dtype=asked.s_c.dtype)
-    return _press_contacts_oblique(geometry, material, options, rings, phi_c, asked)
+    return _press_contacts_oblique(geometry, material, options, phi_c, asked)
 
 
 def _check_oblique(options: Options, rings: Rings) -> None:
@@ -121,11 +120,6 @@ def _check_oblique(options: Options, rings: Rings) -> None:
             f"{name} needs contact='unilateral', found 'bonded': a tool that is glued holds the "
             "wall along the surface, too; press by `press_oblique`"
         )
-    if options.half_width != 0:
-        raise ValueError(
-            f"{name} needs half_width=0, found {options.half_width:g}: a tool with a width is for "
-            "the midline; press by `press_contacts`"
-        )
     if rings == "arch":
         raise ValueError(
             f"{name} needs rings='arch2' or 'mat', found 'arch': it has no motion of a ring at one "
@@ -133,18 +127,17 @@ def _check_oblique(options: Options, rings: Rings) -> None:
         )
 
 
-@functools.partial(jax.jit, static_argnames=("options", "rings"), inline=True)
+@functools.partial(jax.jit, static_argnames="options", inline=True)
 def _press_contacts_oblique(
     geometry: Geometry,
     material: Material,
-    options: Options,
-    rings: Rings,
+    options: ObliqueOptions,
     phi_c: Float[Array, " m"],
     asked: Asked,
 ) -> ObliqueContacts:
     """`press_contacts_oblique`, of arguments that are checked."""
-    shear = options.shear
-    used = (*read_values(options), *skeleton.read_values(rings, axial=False, shear=shear))
+    press, levels = options.press, {"rings": options.rings, "shear": options.press.shear}
+    used = (*read_values(press), *skeleton.read_values(**levels, axial=False))
     s_c = jnp.where(asked.present, asked.s_c, geometry.length / 2)
     s_c, refused = jax.vmap(lambda s: validate(geometry, material, s, used)[1:])(s_c)
     material = validate(geometry, material, s_c[0], used).material
@@ -152,9 +145,9 @@ def _press_contacts_oblique(
     why = jnp.where(jnp.isnan(phi_c), PressStatus.NON_FINITE, PressStatus.BEHIND_GAP)
     on = on | ~asked.present | (refused != PressStatus.OK)
     refused = jnp.max(jnp.where(on, refused, why)).astype(jnp.int8)
-    unit = influence_vector(geometry, material, s_c, at, rings=rings, shear=shear)
-    law = jax.vmap(lambda s: local_law(geometry, material, s, options))(s_c)
-    force, depth, status = solve_rows(asked, unit.compliance, law, options, geometry.radius)
+    unit = influence_vector(geometry, material, s_c, at, **levels)
+    law = jax.vmap(lambda s: local_law(geometry, material, s, press))(s_c)
+    force, depth, status = solve_rows(asked, unit.compliance, law, press, geometry.radius)
     unit, force, depth = mask(refused, unit, force, depth)
 
     def by_all(v):
@@ -171,7 +164,7 @@ def _press_contacts_oblique(
     return ObliqueContacts(
         force=each(jax.vmap(local_frame)(at)[:, 0]),
         depth=depth,
-        skeleton=by_all(unit.contacts),
+        skeleton=by_all(own_contacts(unit)),
         joints=by_all(unit.joints),
         loads=each(unit.loads),
         end_U=by_all(unit.end_U),

@@ -39,6 +39,8 @@ class SceneFacts:
         along: largest axial motion of the tool while it presses, against its whole motion.
         across: the same round the tube.
         slip: largest motion of the tool along the surface while it presses, mm.
+        drags: whether more than a twentieth of its way is along the surface (of a row of several
+            tools, see `needs.drags`).
         spacing: smallest distance of two rings, mm.
         friction: whether the tool has a coefficient of friction.
         known: optional values of the material that are there; `SECTIONS` alone: of a
@@ -61,6 +63,7 @@ class SceneFacts:
     along: float = 0.0
     across: float = 0.0
     slip: float = 0.0
+    drags: bool = False
     spacing: float = math.inf
     friction: bool = False
     known: frozenset[str] = frozenset()

@@ -91,12 +91,15 @@ def lay_out(
     )  # fmt: skip
 
 
-def fit(dents: Dents, depth: Float[Array, " m"]) -> list[local.Dent]:
+def fit(
+    dents: Dents, depth: Float[Array, " m"], inward: Float[Array, "m 3"] | None = None
+) -> list[local.Dent]:
     """The part of the correction that the centres of each tool carry.
 
     Args:
         dents: from `lay_out`.
         depth: local indentation of each contact, inwards, mm; 0: it does not press.
+        inward: normal of each contact, along which its dent is; None: all are on the midline.
     """
     m, n = dents.own.shape
     if dents.sags is None:
@@ -112,7 +115,10 @@ def fit(dents: Dents, depth: Float[Array, " m"]) -> list[local.Dent]:
     foreign = jnp.where(dents.own | (depth == 0)[:, None], 0, dents.beside)
     softness = jnp.where(dents.contact, 0, jnp.max(foreign, axis=0))
     softness = jnp.where(owned == 0, NOTHING, softness)
-    way = jnp.array([0, -1, 0], depth.dtype)
-    whole = local.fit(dents.centres, target[:, None], dents.reach, way, softness)
+    way, targets = jnp.array([0, -1, 0], depth.dtype), target[:, None]
+    if inward is not None:
+        owner = jnp.where(dents.contact, jnp.asarray(np.argmax(dents.own, axis=0)), most)
+        way, targets = None, targets * inward[owner]
+    whole = local.fit(dents.centres, targets, dents.reach, way, softness)
     parts = (v.reshape(m, n // m, -1) for v in (whole.centres, whole.weights))
     return [local.Dent(c, w, whole.reach, way) for c, w in zip(*parts, strict=True)]

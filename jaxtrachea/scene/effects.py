@@ -115,9 +115,11 @@ def _rings(case: Case) -> Verdict:
 
 
 def _axial(case: Case) -> Verdict:
-    needed = case.prescribed and case.facts.along > 0
+    needed = case.prescribed and case.facts.along > 0 and case.facts.tools == 1
     cannot = "" if EFFECTS["axial"].given(case.facts.known) else "EA_L is not given"
     reason = "the tool moves along the tube" if needed else "no motion along the tube"
+    if case.facts.tools > 1:
+        cannot = reason = "several tools slide on the wall: none moves it along the tube"
     if needed and cannot:
         reason = f"{cannot}; the skeleton does not stretch"
     return _switch(needed and not cannot, reason, cannot)
@@ -238,7 +240,9 @@ def _tools(case: Case) -> Verdict:
         why = "with coupling 'total' no force knows the skeleton: contacts do not feel one another"
         refused["coupled"] = why, "use coupling 'series'"
         return Verdict("apart", f"{count} tools; {why}", refused)
-    return Verdict("coupled", f"{count} tools: the forces of all move each of them", refused)
+    slide = "; they slide without friction" if case.levels["second_plane"] == "on" else ""
+    reason = f"{count} tools: the forces of all move each of them{slide}"
+    return Verdict("coupled", reason, refused)
 
 
 def _no_company(case: Case) -> tuple[str, str] | None:
@@ -254,13 +258,8 @@ def _no_company(case: Case) -> tuple[str, str] | None:
             "a tool does not keep its place (contact_point 'per_step')",
             f"shorten its path along the surface, or set contact_point 'fixed', {one_each}",
         )
-    if levels["second_plane"] != "off":
-        return (
-            "off the midline, obliquely, with friction or with rings that bend (second_plane 'on') "
-            "a coupling of contacts that is continuous in their angle is not derived",
-            "press straight in on the midline with friction 'off', contact_point 'fixed' and rings "
-            f"'mat', {one_each}",
-        )
+    if levels["second_plane"] != "off" and (cannot := _no_lines(case)):
+        return cannot[0], f"{cannot[1]}, {one_each}"
     if levels["skeleton"] != "linear":
         return "a skeleton softens by one contact", f"set skeleton 'linear', {one_each}"
     if levels["relaxation"] != "off":
@@ -268,6 +267,31 @@ def _no_company(case: Case) -> tuple[str, str] | None:
             "a force that relaxes is derived for one contact",
             f"set relaxation 'off' (the forces of the long run), {one_each}",
         )
+    return None
+
+
+def _no_lines(case: Case) -> tuple[str, str] | None:
+    """Why several tools cannot press as vectors, and the cure; None: they can, without friction."""
+    levels = case.levels
+    if levels["friction"] == "on":
+        off = "set friction 'off' and contact_point 'fixed'"
+        return "friction is derived for one tool", off
+    if case.facts.drags:
+        return (
+            "one of them moves along the wall by more than a twentieth of its way: what it drags "
+            "along needs friction, which is derived for one tool",
+            "press straight in",
+        )
+    if case.options.contact == "bonded":
+        return (
+            "off the midline, or where rings bend, a tool that is glued holds the wall along the "
+            "surface, too, which is derived for one tool",
+            "set contact 'unilateral', or press on the midline with rings 'mat'",
+        )
+    if levels["rings"] == "arch":
+        return "rings 'arch' have no motion at one angle by a load at another", "use 'arch2'"
+    if levels["surface"] == "phong":
+        return "'phong' interpolates one line of joints", "use 'hermite' or 'linear'"
     return None
 
 

@@ -17,6 +17,7 @@ from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.needs import (
     PLANNED,
     axial,
+    drags,
     elsewhere,
     lateral,
     motion_of,
@@ -89,6 +90,7 @@ def facts_of(
         along=largest(motion.along, axial(motion, PLANNED)) / whole,
         across=largest(motion.across, lateral(motion, PLANNED)) / whole,
         slip=largest(motion.slip, slides(motion, PLANNED)),
+        drags=bool(drags(motion, PLANNED).any()),
         spacing=float(np.diff(x).min()) if len(x) > 1 else float(scene.geometry.length),
         friction=scene.friction is not None,
         known=given_values(material),
@@ -114,7 +116,7 @@ def facts_together(each: Sequence[SceneFacts]) -> SceneFacts:
         return max(values)
 
     whole = "angle", "several_points", "along", "across", "slip", "friction", "near"
-    whole += "way_fixed", "way_per_step", "duration"
+    whole += "way_fixed", "way_per_step", "duration", "drags"
     changed = {name: joined(name) for name in whole}
     return dataclasses.replace(each[0], tools=len(each), **changed)
 

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 COVERED = 1e-4
 #: The same where a plan is made: half of it, as its program has other roundings than the rules.
 PLANNED = COVERED / 2
+#: How much more of a way along the surface several tools may have, which slide without friction.
+DRAGS = 1000
 
 
 class Motion(NamedTuple):
@@ -69,6 +71,11 @@ def lateral(motion: Motion, covered: float = COVERED):
 def slides(motion: Motion, covered: float = COVERED):
     """Whether it moves along the surface."""
     return _moves(motion.slip, motion.length, covered)
+
+
+def drags(motion: Motion, covered: float = COVERED):
+    """Whether so much of its way is along the surface that friction counts: a tenth."""
+    return motion.slip > DRAGS * covered * motion.length + covered
 
 
 def elsewhere(motion: Motion, covered: float = COVERED):

@@ -98,7 +98,8 @@ def _name_dimensions(series: h5py.Group, data: h5py.Dataset, of_tools: bool) -> 
     elif of_tools:
         names = *before, "xyz"
     else:
-        names = ("row", "xyz") if data.ndim == 2 else ("row", middle, "xyz")
+        names = ("row", "tool", middle, "xyz") if data.ndim == 4 else ("row", middle, "xyz")
+        names = ("row", "xyz") if data.ndim == 2 else names
     for axis, (name, size) in enumerate(zip(names, data.shape, strict=False)):
         if name not in series:
             scale = series.create_dataset(name, shape=(size,), dtype=">f4")

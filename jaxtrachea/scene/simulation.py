@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import check_word
@@ -69,7 +70,8 @@ class Simulation(NamedTuple):
             None: without contact or with a fixed contact point.
         depth: local indentation.
         skeleton: displacement of C with the skeleton.
-        joints: displacement of each joint; shape (rows, rings, 3).
+        joints: displacement of each joint; shape (rows, rings, 3). Of several tools off the
+            midline the joints of each, on its meridian; (rows, tools, rings, 3). So of `loads`.
         loads: force of the ligament on each ring; x: axial force that passes. None of deforming
             cross-sections: a wall joins their rings, no line.
         end_U: displacement of the rings' ends at -alpha.
@@ -99,8 +101,8 @@ class Simulation(NamedTuple):
     moment: Float[Array, "rows *tools 3"] | None
     depth: Float[Array, "rows *tools 3"]
     skeleton: Float[Array, "rows *tools 3"]
-    joints: Float[Array, "rows rings 3"] | None
-    loads: Float[Array, "rows rings 3"] | None
+    joints: Float[Array, "rows *tools rings 3"] | None
+    loads: Float[Array, "rows *tools rings 3"] | None
     end_U: Float[Array, "rows rings 3"] | None
     end_V: Float[Array, "rows rings 3"] | None
     slip: Float[Array, "rows *tools 3"] | None
@@ -187,7 +189,8 @@ def as_simulation(found: dict[str, Any]) -> Simulation:
 
 def of_tool(result: Simulation, tool: int) -> Simulation:
     """Of a result for several tools that of one, without their axis."""
-    fields = {name: getattr(result, name) for name in OF_TOOLS}
+    own = (*OF_TOOLS, *(n for n in ("joints", "loads") if np.ndim(getattr(result, n)) == 4))
+    fields = {name: getattr(result, name) for name in own}
     return result._replace(**{n: v[:, tool] for n, v in fields.items() if v is not None})
 
 

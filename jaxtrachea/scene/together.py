@@ -1,8 +1,9 @@
 """Several tools on one trachea, each of which feels the others: forces, skeleton and surface.
 
 Every tool comes and touches as it would alone (`approach`); all of them press one ligament on the
-midline (`mechanics.influence`, `mechanics.contacts`), and the surface follows one line of joints on
-which every contact is a node, with the dents of all (`dents`).
+midline (`mechanics.influence`), or each the ligament of its own meridian (`influence_vector`), in
+one equilibrium (`mechanics.contacts`). The surface follows the lines of joints on which contacts
+are nodes (`lines`), with the dents of all (`dents`).
 """
 
 import functools
@@ -13,12 +14,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea._numerics import full_precision, product_of_rows
+from jaxtrachea._numerics import full_precision, product, product_of_rows, scaled
 from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.influence import Influence, influence, level_influence
+from jaxtrachea.mechanics.influence_vector import VectorInfluence, influence_vector
 from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond
-from jaxtrachea.scene import dents
+from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.scene import dents, lines
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.overlap import overlapping
@@ -26,7 +29,7 @@ from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
-from jaxtrachea.surface import local, regions
+from jaxtrachea.surface import local
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import place
 
@@ -37,11 +40,8 @@ class Together(NamedTuple):
     Attributes:
         s: places of the contacts; shape (m,).
         phi: their angles; (m,).
-        skeleton: inward motion of every contact with the skeleton; (rows, m).
         depth: local indentation; (rows, m).
-        joints: inward motion of every ring's joint; (rows, rings).
-        slopes: rotation of the ligament at every joint; (rows, rings).
-        turns: the same at every contact, see `Influence`; (rows, points).
+        lines: motion of the lines of joints.
         made: the way of each tool; None: presses.
         paths: of the tools, as read.
         hidden: rows that were refused; (rows,).
@@ -49,11 +49,8 @@ class Together(NamedTuple):
 
     s: Float[Array, " m"]
     phi: Float[Array, " m"]
-    skeleton: Float[Array, "rows m"]
     depth: Float[Array, "rows m"]
-    joints: Float[Array, "rows rings"]
-    slopes: Float[Array, "rows rings"]
-    turns: Float[Array, "rows points"]
+    lines: lines.Lines
     made: list[Approach | None]
     paths: Sequence[Poses | Presses]
     hidden: Bool[Array, " rows"]
@@ -93,25 +90,26 @@ def press_together(
     }
     hidden = functools.reduce(jnp.logical_or, refused.values())
     presses, used = [p for p, *_ in found], [u for _, u, *_ in found]
-    D = jnp.stack([-p.displacement[:, 1] for p in presses], axis=1)
-    D = jnp.where(hidden[:, None], 0, D)
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
-    unit = _influence(scene, safe, s)
+    D = jnp.stack([_inward_way(scene, *one) for one in zip(presses, phi, strict=True)], axis=1)
+    D = jnp.where(hidden[:, None], 0, D)
+    unit = _influence(scene, safe, s, phi)
     if present is None and scene.plan.options.contact == "bonded":
         present = _touched(made, D)
     depth, force, solved = _forces(scene, safe, s, unit, D, present)
-    skeleton, joints, loads, slopes, turns = (
-        product_of_rows(force, v)
-        for v in (unit.compliance, unit.joints, unit.reactions, unit.slopes, unit.turns)
-    )
     if scene.plan.options.coupling == "total":
-        depth = jnp.where(force == 0, 0, D - skeleton)
-    moved = Together(s, phi, skeleton, depth, joints, slopes, turns, list(made), paths, hidden)
-    vectors = {"force": force, "depth": depth, "skeleton": skeleton}
-    rings = {"joints": joints, "loads": loads, "end_U": joints, "end_V": joints}
-    asked = {"joints": scene.plan.joints, "loads": scene.plan.joints}
-    fields = mask_rows(hidden, {n: _anterior(-v) for n, v in (vectors | rings).items()})
-    fields |= {n: None for n in rings if not asked.get(n, scene.plan.ring_ends)}
+        depth = jnp.where(force == 0, 0, D - product_of_rows(force, unit.compliance))
+    if isinstance(unit, Influence):
+        does, along = lines.on_midline(unit, force, _half(scene)), lambda v: lines.anterior(-v)
+    else:
+        normals, does = jax.vmap(local_frame)(phi)[:, 0], lines.round_the_tube(unit, force)
+        along = functools.partial(_along, normals)
+    moved = Together(s, phi, depth, does.lines, list(made), paths, hidden)
+    rings = {"joints": does.joints, "loads": does.loads} if scene.plan.joints else {}
+    if scene.plan.ring_ends:
+        rings |= {"end_U": does.lines.U, "end_V": does.lines.V}
+    vectors = {"force": along(force), "depth": along(depth), "skeleton": does.skeleton}
+    fields = mask_rows(hidden, vectors | rings)
     share = [
         depth_share(v, fields["depth"][:, j], fields["skeleton"][:, j], found[j][2])
         for j, v in enumerate(each)
@@ -147,8 +145,26 @@ def _in_space(each: list[Scene], paths: Sequence[Poses | Presses], status):
     return jnp.where(plain & overlapping(tools, poses), word, status)
 
 
-def _influence(scene: Scene, material: Material, s: Float[Array, " m"]) -> Influence:
+def _inward_way(scene: Scene, presses: Presses, phi) -> Float[Array, " rows"]:
+    """Displacement of a tool along the inward normal, mm."""
+    if not scene.plan.second_plane:
+        return -presses.displacement[:, 1]
+    return product(presses.displacement, local_frame(phi)[0])
+
+
+def _along(normals: Float[Array, "m 3"], v: Float[Array, "rows m"]) -> Float[Array, "rows m 3"]:
+    """Vectors along the inward normals."""
+    return scaled(v[..., None], normals[None])
+
+
+def _influence(
+    scene: Scene, material: Material, s: Float[Array, " m"], phi: Float[Array, " m"]
+) -> Influence | VectorInfluence:
     """What every contact moves, of points or of punches."""
+    plan = scene.plan
+    if plan.second_plane:
+        levels = {"rings": plan.rings, "shear": plan.options.shear}
+        return influence_vector(scene.geometry, material, s, phi, **levels)
     beam, half = ligament_beam(scene.geometry, material, scene.plan.options), _half(scene)
     return influence(beam, s) if half == 0 else level_influence(beam, s, half)
 
@@ -167,7 +183,7 @@ def _touched(made: Sequence[Approach | None], D) -> Bool[Array, "rows m"]:
     ], axis=1)  # fmt: skip
 
 
-def _forces(scene: Scene, material: Material, s, unit: Influence, D, present):
+def _forces(scene: Scene, material: Material, s, unit, D, present):
     """Local indentations, forces and statuses of all contacts; shape (rows, m) each."""
     options = scene.plan.options
     law = jax.vmap(lambda at: local_law(scene.geometry, material, at, options))(s)
@@ -191,11 +207,6 @@ def _forces(scene: Scene, material: Material, s, unit: Influence, D, present):
     return found.depth, found.force, found.status
 
 
-def _anterior(v):
-    """Vectors with only a y component."""
-    return jnp.stack([jnp.zeros_like(v), v, jnp.zeros_like(v)], -1)
-
-
 @full_precision
 def deform_together(scene: Scene, moved: Together) -> Float[Array, "rows vertices 3"] | None:
     """Deformed vertices, NaN in the rows that were refused; None: the plan has no surface."""
@@ -206,27 +217,18 @@ def deform_together(scene: Scene, moved: Together) -> Float[Array, "rows vertice
         raise ValueError("scene.mesh or scene.binding is None; the plan has a surface")
     method, straight, runs = plan.surface, mesh.straight, scene.runs
     places = moved.s if half == 0 else jnp.concatenate([moved.s - half, moved.s + half])
-    order = jnp.argsort(places)
-    share = regions.weigh(binding, jnp.zeros_like(moved.s[0]))
+    weights = lines.weigh(binding, moved.phi, moved.lines.joints.shape[1])
+    inward = jax.vmap(local_frame)(moved.phi)[:, 0] if plan.second_plane else None
     laid = None
     if plan.dent:
         laid = dents.lay_out(views(scene), moved.s, moved.phi, moved.paths, moved.made)
 
     def one(row):
-        skeleton, depth, joints, slopes, turns = row
-        C = _anterior(-skeleton)
-        C = C if half == 0 else jnp.concatenate([C, C])
-        y = _anterior(-joints)
-
-        def slope(v):
-            return jnp.stack([-v, jnp.zeros_like(v)], -1)
-
-        keys = regions.clamped(places[order], C[order], y, y, y, slope(slopes), slope(turns)[order])
-        u = regions.interpolate(binding, share, keys, method=method)
+        depth, of_row = row
+        u = lines.interpolate(binding, weights, places, of_row, method)
         if laid is not None and runs is not None:
-            for dent, s in zip(dents.fit(laid, depth), moved.s, strict=True):
+            for dent, s in zip(dents.fit(laid, depth, inward), moved.s, strict=True):
                 u = local.add_correction(u, dent, straight, runs, s)
         return place(mesh, u)
 
-    rows = moved.skeleton, moved.depth, moved.joints, moved.slopes, moved.turns
-    return mask_rows(moved.hidden, one_by_one(one, rows))
+    return mask_rows(moved.hidden, one_by_one(one, (moved.depth, moved.lines)))

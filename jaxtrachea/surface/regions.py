@@ -186,12 +186,14 @@ def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
     Returns:
         The weights; NaN if C lies behind the ends of the rings.
     """
-    shares = _shares(binding.phi, phi_c, binding.half_angle)
+    shares = line_shares(binding.phi, phi_c, binding.half_angle)
     return Weights(jnp.stack(shares), phi_c)
 
 
 @jax.custom_jvp
-def _shares(phi, phi_c, alpha) -> tuple[Array, ...]:
+def line_shares(
+    phi: Float[Array, "*many"], phi_c: Float[Array, ""], alpha: Float[Array, ""]
+) -> tuple[Array, ...]:
     """Of U, J and V at the angles phi; see `weigh`."""
     on = jnp.abs(phi_c) <= alpha * (1 + 8 * epsilon(phi.dtype))
     to_U = jnp.maximum(alpha, NARROWEST - phi_c)
@@ -207,13 +209,13 @@ def _shares(phi, phi_c, alpha) -> tuple[Array, ...]:
     return U, from_U * from_V, V
 
 
-@functools.partial(_shares.defjvp, symbolic_zeros=True)
-def _shares_jvp(primals, tangents):
+@functools.partial(line_shares.defjvp, symbolic_zeros=True)
+def _line_shares_jvp(primals, tangents):
     """Going back, how all of them change by one angle comes before what that adds up to."""
     moving = [i for i, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
 
     def along(fixed, i, v):
-        return jax.jvp(lambda v: _shares.fun(*replaced(fixed, [i], [v])), (fixed[i],), (v,))[1]
+        return jax.jvp(lambda v: line_shares.fun(*replaced(fixed, [i], [v])), (fixed[i],), (v,))[1]
 
     def push(fixed, tangents):
         terms = [along(fixed, i, v) for i, v in zip(moving, tangents, strict=True)]
@@ -228,7 +230,7 @@ def _shares_jvp(primals, tangents):
             out.append(by_each if i == 0 else total(total(by_each).ravel()))
         return out
 
-    out = _shares(*primals)
+    out = line_shares(*primals)
     return out, tuple(linear(push, pull, primals, [tangents[i] for i in moving], out))
 
 

@@ -4,12 +4,13 @@ import dataclasses
 import functools
 import tomllib
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from small_scenes import BALL, BARE, SPRINGS, TUBE, ball, presses
+from small_scenes import BALL, BARE, MATERIAL, OUTER, SPRINGS, TUBE, ball, poses, presses
 
 from jaxtrachea import (
     EffectOptions,
@@ -20,6 +21,7 @@ from jaxtrachea import (
     Tool,
     make_scene,
     press_contacts,
+    press_contacts_oblique,
     read_simulation,
     simulate,
 )
@@ -32,9 +34,11 @@ from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.results import write_forces, write_simulation
 from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.simulation import of_tool
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local
+from jaxtrachea.surface.lines import weigh_lines
 from jaxtrachea.trachea.tube import make_tube
 
 pytestmark = pytest.mark.compiling
@@ -286,6 +290,93 @@ def test_a_session_goes_the_same_way():
     assert np.isnan(broken.force).all()
 
 
+#: Meridians of vertices of `ROUND`.
+SIDE = 4 * np.pi / 9
+WAYS = {"left": (3.0, SIDE), "right": (2.0, -SIDE), "front": (0.2, 0.0)}
+
+
+def inwards(phi):
+    return -np.array([0, np.cos(phi), np.sin(phi)])
+
+
+@functools.cache
+def pinched():
+    """Two tools pinch the tube; the front bulges against a third."""
+    paths = {n: presses(D * inwards(phi), s=NEXT, phi=phi) for n, (D, phi) in WAYS.items()}
+    scene = make_scene(TUBE, MATERIAL, paths, mesh=ROUND)
+    return scene, paths, jax.device_get(simulate(scene, MATERIAL, paths))
+
+
+@pytest.mark.slow
+def test_a_pinch_is_press_contacts_oblique_and_the_wall_meets_all_tools():
+    scene, _, out = pinched()
+    assert (scene.plan.tools, scene.plan.rings) == ("coupled", "arch2")
+    depths, angles = zip(*WAYS.values(), strict=True)
+    D = np.linspace(0, 1, 3)[:, None] * depths
+    found = press_contacts_oblique(TUBE, MATERIAL, [NEXT] * 3, angles, D)
+    for name in ("force", "joints", "loads", "end_U", "end_V", "skeleton"):
+        np.testing.assert_allclose(getattr(out, name), getattr(found, name), rtol=0, atol=1e-13)
+    assert out.force[-1, 2, 1] < -0.01
+    there = np.isclose(ROUND.distance, 12.6) & np.isclose(ROUND.s, NEXT)
+    for j, phi in enumerate(angles):
+        (vertex,) = np.flatnonzero(there & (np.abs(ROUND.phi - phi) < 1e-9))
+        moved = out.vertices[:, vertex] - np.asarray(ROUND.vertices)[vertex]
+        np.testing.assert_allclose(moved @ inwards(phi), D[:, j], rtol=0, atol=1e-9)
+
+
+NAMES = "row", "tool", "ring", "xyz"
+
+
+@pytest.mark.slow
+def test_files_of_a_pinch(tmp_path):
+    scene, paths, out = pinched()
+    write_simulation(tmp_path / "simulation.h5", scene, MATERIAL, paths, out, {})
+    with h5py.File(tmp_path / "simulation.h5") as file:
+        joints = file["series/joints"]
+        assert [d[0].name for d in joints.dims] == [f"/series/{n}" for n in NAMES]
+    read = read_simulation(tmp_path / "simulation.h5").simulation
+    np.testing.assert_array_equal(read.joints, out.joints)
+    np.testing.assert_array_equal(of_tool(out, 1).joints, out.joints[:, 1])
+
+
+@pytest.mark.slow
+def test_a_session_pinches_as_a_path_does():
+    """Balls at both sides; one that is lifted away leaves the others."""
+    out = OUTER + 5
+    paths = {
+        "left": poses([75, 0, out + 0.5], [75, 0, out - 2.5]),
+        "right": poses([77, 0, -out - 0.2], [77, 0, -out + 2]),
+    }
+    scene = make_scene(TUBE, MATERIAL, paths, tool=dict.fromkeys(paths, BALL), effects=BARE)
+    true = jax.device_get(simulate(scene, MATERIAL, paths))
+    session = Session(scene, MATERIAL)
+    for row in range(4):
+        found = session.step({n: (p.rotation[row], p.translation[row]) for n, p in paths.items()})
+        np.testing.assert_allclose(found.force, true.force[row], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(found.joints, true.joints[row], rtol=0, atol=1e-13)
+    lifted = session.step({}, present={"right": False})
+    assert lifted.status.tolist() == [OK, NO_CONTACT]
+    assert np.linalg.norm(lifted.force[0]) < 0.7 * np.linalg.norm(true.force[-1, 0])
+
+
+@pytest.mark.slow
+def test_lines_round_the_tube_meet_each_other():
+    """Linear between U, the lines and V; on one meridian lines share it."""
+    binding = scene_of_presses().binding
+    for phi in ([-0.5, 1.2, 0.4], [0.3, 0.3, -1.0], [0.3, 0.3 + 1e-9, -1.0]):
+        lines = jax.jit(weigh_lines)(binding, jnp.array(phi))
+        angles, alpha = np.asarray(binding.phi), float(TUBE.half_angle)
+        on = np.abs(angles) <= alpha
+        values = np.cos(np.array([-alpha, *phi, alpha]))
+        found = lines[0].U * values[0] + lines[0].V * values[-1]
+        found += sum(line.J * v for line, v in zip(lines, values[1:], strict=False))
+        at, first = np.unique([-alpha, *phi, alpha], return_index=True)
+        true = np.interp(angles, at, values[first])
+        np.testing.assert_allclose(np.asarray(found)[on], true[on], rtol=0, atol=1e-7)
+        whole = sum(line.U + line.J + line.V for line in lines)
+        np.testing.assert_allclose(whole, 1, rtol=0, atol=1e-7)
+
+
 @pytest.mark.slow
 def test_tools_that_overlap_in_space():
     """Two balls by the distance of their centres, and a box beside a ball."""
@@ -341,11 +432,13 @@ def test_what_does_not_go_together():
 @pytest.mark.parametrize(
     ("facts", "effects", "words"),
     [
-        ({"angle": 0.5}, {}, "second_plane 'on'"),
-        ({"known": frozenset({"EI_C", "k_t"})}, {}, "rings 'mat'"),
+        ({"angle": 0.5}, {"contact": "bonded"}, "set contact 'unilateral'"),
+        ({"angle": 0.5, "known": frozenset({"EI_C", "k_t"})}, {"rings": "arch"}, "use 'arch2'"),
+        ({"angle": 0.5, "drags": True}, {}, "press straight in"),
+        ({"angle": 0.5, "known": frozenset({"EA_L"})}, {"axial": "on"}, "slide on the wall"),
         ({"several_points": True}, {}, "contact_point 'fixed'"),
         ({"poses": True, "slip": 40.0, "spacing": 10.0}, {}, "does not keep its place"),
-        ({"slip": 1.0, "along": 0.5, "friction": True}, {}, "with friction 'off'"),
+        ({"slip": 1.0, "along": 0.5, "friction": True}, {}, "set friction 'off'"),
         ({"known": frozenset({"sections"})}, {"contact": "bonded"}, r"give \[material\] in"),
         ({"known": frozenset({"relaxation"}), "timed": True}, {}, "set relaxation 'off'"),
         ({"known": frozenset({"e_1", "e_2"}), "way_fixed": (0.0, 0.2), "softness": (-1.4, 0.9)}, {},
@@ -359,6 +452,14 @@ def test_what_no_plan_couples(facts, effects, words):
     with pytest.raises(PlanError, match=words):
         make_plan(SceneFacts(**({"tools": 2, "mesh": False} | facts)),
                   EffectOptions(want_surface=False, **effects))  # fmt: skip
+
+
+def test_off_the_midline_tools_slide_without_friction():
+    facts = SceneFacts(tools=2, mesh=False, angle=1.5, along=0.01, known=frozenset({"EA_L"}))
+    plan = make_plan(facts, EffectOptions(want_surface=False))
+    assert (plan.tools, plan.second_plane, plan.axial) == ("coupled", True, False)
+    (word,) = [e.reason for e in plan.effects if e.name == "tools"]
+    assert word.endswith("they slide without friction")
 
 
 TOOLS = """
