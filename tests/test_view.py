@@ -505,7 +505,7 @@ def test_a_fit_sample_by_sample(tmp_path):
     try:
         window = Browser()
         window.go(server.address)
-        window.wait("document.querySelector('#play')", 400)
+        window.wait("!!document.querySelector('#play')", 400)
         where = "document.querySelector('#where').innerText"
         assert window.run(where).startswith("0 samples, TOO_FEW_DATA; 4 presses are there")
         for n in (1, 2):
