@@ -161,7 +161,7 @@ class Live(Worker):
 
         begin = time.monotonic()
         dt, self._before = begin - (self._before or begin), begin
-        result = session.step(pose[:9].reshape(3, 3), pose[9:], dt)
+        result = session.step(pose[:9].reshape(3, 3), pose[9:], np.float64(dt))
         frame = frame_of(session.scene.tool, pose, result, time.monotonic() - begin)
         return frame._replace(time=begin - self._began)
 
@@ -185,4 +185,4 @@ def _alike(a: Frame, b: Frame) -> bool:
     if a.status != b.status or a.vertices is None or b.vertices is None:
         return a.status == b.status
     force, place = abs(a.force - b.force).max(), abs(a.vertices - b.vertices).max()
-    return force < SEEN[0] and place < SEEN[1]
+    return bool(force < SEEN[0] and place < SEEN[1])
