@@ -7,9 +7,9 @@ once, what stands there instead, and the tests that a developer would expect to 
 copied to a temporary folder. All these tests must pass there first. Then each fault is made alone,
 its tests are run, and it is taken back: `caught` if a test fails, `survived` if all pass. NAME:
 these rows only, all without one. `--list`: no test is run, the rows are held against the sources.
-Long tests count, `--slow`: slow ones, too. Results go to tests/bench/results/mutations.jsonl, the last line of
-a name is the one that counts. The exit code is 1 where a fault survived. All rows take some 20
-minutes of one core.
+Long tests count, `--slow`: slow ones, too. Results go to tests/bench/results/mutations.jsonl, the
+last line of a name is the one that counts. The exit code is 1 where a fault survived. All rows take
+some 20 minutes of one core.
 """
 
 import argparse

@@ -22,7 +22,7 @@ from jaxtrachea.trachea.material import Material
 
 pytestmark = pytest.mark.compiling
 #: All but the refusals share programs that take ten seconds each to compile.
-slow = pytest.mark.slow
+long = pytest.mark.long
 
 VALUES = {"EI_L": 1.9, "EI_side": 2.4, "GA_L": 9.0, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02,
           "EI_C": 9.9, "k_t": 0.03}  # fmt: skip
@@ -90,7 +90,7 @@ def by_elements(s, phi, rings):
     return found["w_C"] @ F[0], found["w"] @ F[0]
 
 
-@slow
+@long
 @pytest.mark.parametrize("rings", ["mat", "arch2"])
 def test_opposite_and_equal_meridians_against_finite_elements(rings):
     """Both loads, each at the other's place; on one meridian on one strip."""
@@ -121,7 +121,7 @@ def fields(C, at, fine):
     return P, V, M - turn / LENGTH
 
 
-@slow
+@long
 def test_a_part_of_two_strips_in_common_by_their_moments():
     """Rings, and kappa times the energy of what both strips bear, all from exact elements."""
     s, phi, ring = np.array([73.0, 77.0, 120.0]), np.array([0.3, 0.4, -1.5]), _ring("arch2")
@@ -137,7 +137,7 @@ def test_a_part_of_two_strips_in_common_by_their_moments():
     np.testing.assert_allclose(C[0, 1], by_rings + kappa * shared, rtol=0, atol=1e-11 * C.max())
 
 
-@slow
+@long
 def test_one_contact_is_the_skeleton_of_one():
     material = Material(**VALUES)
     more = {"axial": False, "shear": True}
@@ -155,7 +155,7 @@ def test_one_contact_is_the_skeleton_of_one():
         np.testing.assert_allclose(getattr(got, name)[0], v, rtol=0, atol=1e-12)
 
 
-@slow
+@long
 def test_continuous_across_equal_meridians_and_the_ends_of_a_strip():
     """The largest step over 1e-4 rad is below 1e-3 of C."""
     for middle in (0.4, 0.4 + STRIP, 0.4 - STRIP):
@@ -168,7 +168,7 @@ def test_continuous_across_equal_meridians_and_the_ends_of_a_strip():
         assert np.abs(np.diff(C, axis=0)).max() < 1e-3 * np.abs(C).max()
 
 
-@slow
+@long
 def test_compliances_are_positive_semi_definite():
     """10,000 random sets, a third of them with contacts close to each other or on one place."""
     rng = np.random.default_rng(5)
@@ -198,7 +198,7 @@ ALL = np.ones(3, bool)
 ROWS = np.array([[2.0, 3.0, -0.05], [2.0, 3.0, 1.0], [1.0, 0.1, 4.0]])
 
 
-@slow
+@long
 def test_a_pinch_brings_the_wall_against_a_tool_in_front():
     """Ring and strip balance the laws, and the front bulges towards the third tool."""
     found = pressed(S, PHI, ROWS, VALUES, ALL)
@@ -217,7 +217,7 @@ def test_a_pinch_brings_the_wall_against_a_tool_in_front():
     assert np.abs(rest).max() < 0.05 * F.max()  # what the clamps bear
 
 
-@slow
+@long
 def test_the_order_of_tools_does_not_matter():
     order = np.array([2, 0, 1])
     a = pressed(S, PHI, ROWS, VALUES, ALL)
@@ -227,7 +227,7 @@ def test_the_order_of_tools_does_not_matter():
     np.testing.assert_allclose(b.end_U, a.end_U, rtol=0, atol=1e-12)
 
 
-@slow
+@long
 def test_on_the_midline_it_is_press_contacts():
     D = np.array([[3.0, 1.0, 4.0], [4.0, 0.5, 0.1], [-1.0, 2.0, 0.0]])
     got = pressed(S, 0 * PHI, D, VALUES, ALL, rings="mat")
@@ -240,7 +240,7 @@ def test_on_the_midline_it_is_press_contacts():
     assert LIFTED in got.status
 
 
-@slow
+@long
 def test_absent_and_refused_contacts():
     there = np.array([True, False, True])
     got = pressed(np.array([75.0, 900.0, 73.0]), np.array([-1.5, 3.0, 0.0]), ROWS, VALUES, there)

@@ -66,7 +66,7 @@ def deform(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach
         near = jnp.sum((straight - dent.centres[:1]) ** 2, axis=1)
         return trail.touching(scene.tool, pose, near, place(mesh, u), dented)
 
-    moved = moved._replace(dissipated=None, status=None)
+    moved = moved._replace(force=None, loads=None, dissipated=None, status=None)
     led = path if slides and made is not None else None
     share = regions.weigh(binding, where[1]) if together else None
 

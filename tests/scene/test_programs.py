@@ -22,7 +22,7 @@ from jaxtrachea import (
 )
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
-from jaxtrachea.fusion import fuse
+from jaxtrachea.fusion import fuse, one_by_one
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond, unit_deflection
@@ -79,18 +79,19 @@ def move_surface(scene, s, phi, out):
     mesh = scene.mesh
     weights = regions.weigh(scene.binding, phi)
     straight = mesh.straight
-    where = local.centres(s, phi, scene.radius, scene.footprint, 8)
 
     def one(skeleton, joints, U, V, slopes, slope_C, depth):
         keys = regions.clamped(s, skeleton, joints, U, V, slopes, slope_C)
         u = regions.interpolate(scene.binding, weights, keys)
+        # In every row, as in a step of a session: a scan of steps is the session to the bit.
+        where = local.centres(s, phi, scene.radius, scene.footprint, 8)
         share = local.shares(depth, jnp.zeros(8))[:, None]
         dent = local.fit(where, share, 3 * scene.footprint, depth)
         u = local.add_correction(u, dent, straight, scene.runs, s)
         return place(mesh, u)
 
     rows = out.skeleton, out.joints, out.end_U, out.end_V, out.slopes, out.slope_C, out.depth
-    return jax.vmap(one)(*rows)
+    return one_by_one(lambda row: one(*row), rows)
 
 
 def normal(scene, m, p):
@@ -214,11 +215,10 @@ def program(name):
 @pytest.mark.compiling
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_an_unused_effect_adds_no_operation(name):
-    """In the traced program: exactly those of the program by hand."""
+    """In the traced program: no more than in the program by hand, which uses public functions."""
     scene, path, hand = program(name)
-    assert count_operations(simulate, scene, MATERIAL, path) == count_operations(
-        hand, scene, MATERIAL, path
-    )
+    by_plan, own = (count_operations(run, scene, MATERIAL, path) for run in (simulate, hand))
+    assert 0.99 * own < by_plan <= own
 
 
 #: Operations of each row of a normal press for what a plan refuses, counted on paper.
