@@ -456,8 +456,7 @@ def test_each_scene_is_refused_before_the_page_or_can_be_moved(path, monkeypatch
     assert spec.path[-1].duration == (1000.0 if relaxes else None)
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
+@pytest.mark.long
 def test_a_force_that_relaxes_falls_while_the_hand_rests(tmp_path):
     """From the jump to the long run; a twelfth of the force lasts beyond it in 0.2 s, none in 2."""
     scene = tmp_path / "relaxing.toml"
@@ -504,8 +503,7 @@ def wait_until(true, seconds):
 
 
 @needs_browser
-@pytest.mark.slow
-@pytest.mark.compiling
+@pytest.mark.long
 def test_a_fit_sample_by_sample(tmp_path):
     """It pauses, steps and settles; intervals shrink; the page is guarded as that of a scene."""
     force = synthetic.forces(TRUTH[None], displacement=DEPTHS)[0][0]

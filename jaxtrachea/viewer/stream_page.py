@@ -152,6 +152,9 @@ class StreamPage(Page):
         if kind == "log":
             low, high = 10 ** np.floor(np.log10(low)), 10 ** np.ceil(np.log10(high))
         ends = {"min": float(low), "max": float(high)} if high > low else {}
+        # A dashed line to a point far outside keeps a browser busy for minutes.
+        room = (low / 10, high * 10) if kind == "log" else (2 * low - high, 2 * high - low)
+        lines = np.clip(lines, *room) if ends else lines
         chart.options["yAxis"] = {"type": kind, "scale": True, "axisLabel": NO_ENDS, **ends}
         for series, line in zip(chart.options["series"], lines, strict=True):
             series["data"] = [[s.samples, float(v) if np.isfinite(v) else None]

@@ -310,7 +310,7 @@ def pinched():
     return scene, paths, jax.device_get(simulate(scene, MATERIAL, paths))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pinch_is_press_contacts_oblique_and_the_wall_meets_all_tools():
     scene, _, out = pinched()
     assert (scene.plan.tools, scene.plan.rings) == ("coupled", "arch2")
@@ -362,7 +362,7 @@ def test_a_session_pinches_as_a_path_does():
     assert np.linalg.norm(lifted.force[0]) < 0.7 * np.linalg.norm(true.force[-1, 0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_lines_round_the_tube_meet_each_other():
     """Linear between U, the lines and V; on one meridian lines share it."""
     binding = scene_of_presses().binding
