@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
-from jaxtrachea.files.toml import SpecError, read_tables
 
 PortOption = Annotated[
     int | None, typer.Option("--port", min=1, max=65535, help="Of 127.0.0.1; none: a free one.")
@@ -58,6 +57,8 @@ def _content(file: Path) -> dict:
     Raises:
         Stop: no such file, no TOML, or a scene that no hand can move.
     """
+    from jaxtrachea.files.toml import SpecError, read_tables
+
     if not file.is_file():
         raise Stop(f"{file}: there is no such file; name a scene or a fit specification (TOML)")
     try:
@@ -101,11 +102,13 @@ def _experiment(path: Path, begin: Callable[[str], None]):
             f"{path}: data: {len(specimens)} specimens ({specimens[0]}, {specimens[1]}, ...); a "
             "stream is of one: name its files alone in data.files"
         )
+    assert recipe is not None
+    places = {c.s_c for c in curves if c.s_c is not None}
     begin("compiling the fit of a sample")
     online = Online(
         recipe.geometry, recipe.options, recipe.parameters, noise=recipe.noise,
         depth=max(float(c.displacement.max()) for c in curves),
-        candidates=sorted({c.s_c for c in curves}),
+        candidates=sorted(places),
         samples=round(sum(len(c.force) for c in curves) / len(curves)),
     )  # fmt: skip
     return Experiment(online, curves, {p.name: p.unit for p in recipe.parameters})
