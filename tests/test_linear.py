@@ -101,7 +101,7 @@ def test_a_way_back_of_another_shape_is_refused():
 
 def shares(dtype):
     phi = jnp.linspace(-np.pi, np.pi, 60, dtype=dtype)[:-1].reshape(-1, 1)
-    return regions._shares, [phi, jnp.asarray(0.4, dtype), jnp.asarray(2.3, dtype)]
+    return regions.line_shares, [phi, jnp.asarray(0.4, dtype), jnp.asarray(2.3, dtype)]
 
 
 def combined(dtype):
