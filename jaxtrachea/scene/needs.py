@@ -74,7 +74,7 @@ def slides(motion: Motion, covered: float = COVERED):
 
 
 def drags(motion: Motion, covered: float = COVERED):
-    """Whether so much of its way is along the surface that friction counts: a tenth."""
+    """Whether more than a tenth of its way is along the surface (a plan refuses half of that)."""
     return motion.slip > DRAGS * covered * motion.length + covered
 
 
