@@ -45,7 +45,7 @@ def test_statuses():
     np.testing.assert_array_equal(pressed().status, np.array(status)[:, None] + np.zeros(9, int))
     assert np.isnan(pressed().force[5:]).all()
     assert np.isfinite(pressed().force[:5]).all()
-    with pytest.raises(ValueError, match="half_width is -1 mm; expected 0 or more"):
+    with pytest.raises(ValueError, match="half_width is -1.0; expected a finite number, 0 or more"):
         press_sections(
             TUBE,
             SectionMaterial(**VALUES),
