@@ -167,7 +167,8 @@ def test_an_infeasible_start_is_a_status_and_disturbs_nobody(noisy):
     again = fit(make([*rest[:4], *deep, *rest[4:]]), ONE)
     assert again.status[1] == FitStatus.CONVERGED
     assert np.all(np.abs(again.value[1] - truth[0]) < 4 * again.standard_error[1])
-    np.testing.assert_array_equal(again.tried, [1, 1, 1, 1])
+    assert again.tried[1] == 1
+    np.testing.assert_array_equal(again.tried[[0, 2, 3]], together.tried[[0, 2, 3]])
     np.testing.assert_array_equal(again.theta[[0, 2, 3]], together.theta[[0, 2, 3]])
     rescued = fit(again.study.take(np.array([2, 1])), ONE)
     np.testing.assert_allclose(rescued.theta[1], again.theta[1], rtol=0, atol=1e-8)
