@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea._numerics import product_of_rows
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics._matrix2 import apply, solve
 from jaxtrachea.mechanics.skeleton import Rings, local_frame, needed, planes, turned_rings
@@ -123,6 +124,12 @@ def influence_vector(
 def own_contacts(unit: VectorInfluence) -> Float[Array, "m m 3"]:
     """Displacement of every contact, each on its own meridian, per unit force, mm/N."""
     return jnp.stack([unit.contacts[:, i, i] for i in range(unit.contacts.shape[0])], axis=1)
+
+
+def by_all(force: Float[Array, "*n m"], unit: Float[Array, "m *more"]) -> Array:
+    """What all forces do together, of what a unit of each does; shape (*n, *more)."""
+    rows = product_of_rows(force.reshape(-1, force.shape[-1]), unit.reshape(unit.shape[0], -1))
+    return rows.reshape(*force.shape[:-1], *unit.shape[1:])
 
 
 def _einsum(*given):

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_word, shaped
-from jaxtrachea._numerics import product_of_rows, scaled
+from jaxtrachea._numerics import scaled
 from jaxtrachea.mechanics import skeleton
-from jaxtrachea.mechanics.influence_vector import influence_vector, own_contacts
+from jaxtrachea.mechanics.influence_vector import by_all, influence_vector, own_contacts
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import local_law, read_values
@@ -150,11 +150,6 @@ def _press_contacts_oblique(
     force, depth, status = solve_rows(asked, unit.compliance, law, press, geometry.radius)
     unit, force, depth = mask(refused, unit, force, depth)
 
-    def by_all(v):
-        """What all forces together do."""
-        rows = product_of_rows(force.reshape(-1, force.shape[-1]), v.reshape(v.shape[0], -1))
-        return rows.reshape(*force.shape[:-1], *v.shape[1:])
-
     def each(v):
         """What each force does by itself."""
         more = v.ndim - 1
@@ -164,11 +159,11 @@ def _press_contacts_oblique(
     return ObliqueContacts(
         force=each(jax.vmap(local_frame)(at)[:, 0]),
         depth=depth,
-        skeleton=by_all(own_contacts(unit)),
-        joints=by_all(unit.joints),
+        skeleton=by_all(force, own_contacts(unit)),
+        joints=by_all(force, unit.joints),
         loads=each(unit.loads),
-        end_U=by_all(unit.end_U),
-        end_V=by_all(unit.end_V),
+        end_U=by_all(force, unit.end_U),
+        end_V=by_all(force, unit.end_V),
         compliance=unit.compliance,
         status=status_of(refused, status),
     )

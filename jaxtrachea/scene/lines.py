@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import added, product_of_rows, scaled
 from jaxtrachea.mechanics.influence import Influence
-from jaxtrachea.mechanics.influence_vector import VectorInfluence, own_contacts
+from jaxtrachea.mechanics.influence_vector import VectorInfluence, by_all, own_contacts
 from jaxtrachea.surface import regions
 from jaxtrachea.surface.lines import weigh_lines
 
@@ -58,15 +58,10 @@ def on_midline(unit: Influence, force: Float[Array, "rows m"], half: float) -> M
 
 def round_the_tube(unit: VectorInfluence, force: Float[Array, "rows m"]) -> Moved:
     """Contacts anywhere on the rings."""
-
-    def by_all(v):
-        rows = product_of_rows(force, v.reshape(v.shape[0], -1))
-        return rows.reshape(-1, *v.shape[1:])
-
     names = "contacts", "turns", "joints", "slopes", "end_U", "end_V"
-    lines = Lines(*(by_all(getattr(unit, name)) for name in names))
+    lines = Lines(*(by_all(force, getattr(unit, name)) for name in names))
     loads = scaled(force[..., None, None], unit.loads[None])
-    return Moved(by_all(own_contacts(unit)), lines.joints, loads, lines)
+    return Moved(by_all(force, own_contacts(unit)), lines.joints, loads, lines)
 
 
 def anterior(v: Float[Array, "*n"]) -> Float[Array, "*n 3"]:

@@ -1,6 +1,7 @@
 """A page on 127.0.0.1: its server, and the line that says where its work stands."""
 
 import secrets
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +14,7 @@ from jaxtrachea.viewer.worker import Worker
 SMALL = "dense no-caps size=sm padding='3px 8px'"
 
 
-class Page:
+class Page(ABC):
     """One page, and the work that it shows; `ready` builds what there is once that is prepared."""
 
     def __init__(self, worker: Any):
@@ -51,13 +52,13 @@ class Page:
         if self.phase == "ready":
             self.draw()
 
+    @abstractmethod
     def ready(self) -> None:
         """What there is once the work is prepared."""
-        raise NotImplementedError
 
+    @abstractmethod
     def draw(self) -> None:
         """Charts as they are now."""
-        raise NotImplementedError
 
 
 def serve(

@@ -100,8 +100,10 @@ class Stream(Worker):
     def take(self, online: Any) -> None:
         """One sample, of the next press where the present one has ended."""
         if not self.presses or self._taken == len(self.presses[-1][1].force):
-            near = min(self.left, key=lambda c: abs(c.s_c - online.state.next_point))
-            curve = near if self.proposed else self.left[0]
+            curve = self.left[0]
+            if self.proposed:
+                place = online.state.next_point
+                curve = min(self.left, key=lambda c: abs(c.s_c - place))
             self.left = [c for c in self.left if c is not curve]
             online.press(curve.s_c)
             self.presses.append((len(self.states), curve))

@@ -2,6 +2,7 @@
 
 import threading
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -15,7 +16,7 @@ class State(NamedTuple):
     text: str
 
 
-class Worker:
+class Worker(ABC):
     """Work that `prepare` begins and `answer` goes on with; others set what it is to do.
 
     Attributes:
@@ -31,13 +32,13 @@ class Worker:
         self._ended = False
         self._wake = threading.Condition()
 
+    @abstractmethod
     def prepare(self) -> Any:
         """What `answer` works with."""
-        raise NotImplementedError
 
+    @abstractmethod
     def answer(self, made: Any) -> bool:
         """One step, waiting for something to do; whether to go on."""
-        raise NotImplementedError
 
     def start(self) -> None:
         """Begin in a thread of its own."""
