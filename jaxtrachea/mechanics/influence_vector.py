@@ -126,8 +126,8 @@ def own_contacts(unit: VectorInfluence) -> Float[Array, "m m 3"]:
     return jnp.stack([unit.contacts[:, i, i] for i in range(unit.contacts.shape[0])], axis=1)
 
 
-def by_all(force: Float[Array, "*n m"], unit: Float[Array, "m *more"]) -> Array:
-    """What all forces do together, of what a unit of each does; shape (*n, *more)."""
+def by_all(force: Float[Array, "*n m"], unit: Float[Array, "m ..."]) -> Array:
+    """What all forces do together, of what a unit of each does; shape (*n, ...)."""
     rows = product_of_rows(force.reshape(-1, force.shape[-1]), unit.reshape(unit.shape[0], -1))
     return rows.reshape(*force.shape[:-1], *unit.shape[1:])
 
