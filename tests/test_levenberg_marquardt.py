@@ -93,7 +93,8 @@ def test_a_start_beyond_the_bounds_ends_within():
     rows, starts = np.array([1, 2]), np.ones((2, 2))
     solved = levenberg_marquardt(valley, starts, rows, batch=16)
     assert np.all(solved.status == FitStatus.CONVERGED)
-    assert np.allclose(solved.theta, [BOXES[k][3] for k in rows], rtol=0, atol=1e-8)
+    # A relative fall of the cost by 1e-10 is left.
+    assert np.allclose(solved.theta, [BOXES[k][3] for k in rows], rtol=0, atol=1e-5)
 
 
 @pytest.mark.long
