@@ -30,7 +30,7 @@ from websockets.sync.client import connect
 
 from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.status import PressStatus
-from jaxtrachea.viewer.frame import LONGEST, Frame, read_pose
+from jaxtrachea.viewer.frame import LONGEST, Frame, Touch, read_pose
 from jaxtrachea.viewer.live import Live
 from jaxtrachea.viewer.play import PlayError, of_file
 from jaxtrachea.viewer.scene import for_a_mouse
@@ -337,13 +337,18 @@ RADIUS = 12.6
 GOOD = [1, 0, 0, 0, 1, 0, 0, 0, 1, 30, 16, 0]
 
 
+def posed(pose, tool=0, **more):
+    """A message of the page."""
+    return json.dumps({"tool": tool, "pose": pose} | more)
+
+
 @pytest.mark.long
 def test_messages_that_are_none_close_the_socket(server):
     bad = [
-        "x" * 2**20, "no JSON", '"other"', "[" * 4000, json.dumps({"pose": GOOD[:11]}),
-        json.dumps({"pose": [*GOOD[:11], 1e300]}), json.dumps({"pose": [2, *GOOD[1:]]}),
-        '{"pose": [1, 0, 0, 0, 1, 0, 0, 0, 1, 30, 16, NaN]}', json.dumps({"pose": GOOD, "more": 1}),
-        json.dumps({"pose": [True, *GOOD[1:]]}), b"\0" * 40,
+        "x" * 2**20, "no JSON", '"other"', "[" * 4000, posed(GOOD[:11]), posed([*GOOD[:11], 1e300]),
+        posed([2, *GOOD[1:]]), posed([*GOOD[:11], np.nan]), posed(GOOD, more=1), posed(GOOD, 1),
+        posed(GOOD, -1), posed(GOOD, True), json.dumps({"pose": GOOD}),
+        posed([True, *GOOD[1:]]), b"\0" * 40,
     ]  # fmt: skip
     for message in bad:
         with server.socket() as link:
@@ -367,10 +372,10 @@ def test_dragged_about_the_wall_no_row_needs_another_plan(server):
                     off = RADIUS + 5 + gap
                     pose = [*GOOD[:9], s, off * np.cos(phi), off * np.sin(phi)]
                     link.send('"drawn"')
-                    link.send(json.dumps({"pose": pose}))
+                    link.send(posed(pose))
                     head = np.frombuffer(link.recv(timeout=60)[:40], np.float32)
                     assert np.isfinite(head).all()
-                    found.append(PressStatus(int(head[0])))
+                    found.append(PressStatus(int(head[2])))
     assert len(found) == 125
     assert PressStatus.OFF_PLAN not in found
     assert found.count(PressStatus.OK) >= 75
@@ -437,8 +442,7 @@ def test_bad_input_ends_the_command(server, scene_file, tmp_path, monkeypatch, c
 
 
 #: Scenes that no hand can move, and why.
-UNMOVED = {"two_fingers": "several tools", "retractor": "several tools",
-           "cross_sections": "deforming cross-sections"}  # fmt: skip
+UNMOVED = {"cross_sections": "deforming cross-sections"}
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda p: p.stem)
@@ -471,22 +475,22 @@ def test_a_force_that_relaxes_falls_while_the_hand_rests(tmp_path):
         clear = len(live.steps)
         time.sleep(0.5)
         assert len(live.steps) == clear  # nothing changes, nothing is shown
-        pose = live.start_pose
+        pose = live.handled.poses[0].copy()
         pose[9:] = PLACES[0]
         live.move(pose)
         time.sleep(3.0)
-        steps = [f for f in live.steps if f.has_force]
+        steps = [f for f in live.steps if f.has_force(0)]
     finally:
         live.end()
         thread.join()
     assert not live.fault
-    force = np.array([np.linalg.norm(f.force) for f in steps])
+    force = np.array([np.linalg.norm(f.touches[0].force) for f in steps])
     assert len(force) > 4
     assert (np.diff(force) < 0).all()
     session = live.handled.session()
-    pose = live.start_pose[:9].reshape(3, 3)
-    session.step(pose, live.start_pose[9:], np.float64(0))
-    lasting = np.linalg.norm(session.step(pose, PLACES[0], np.float64(1e9)).force)
+    turn = np.eye(3)
+    session.step(turn, live.handled.poses[0, 9:], np.float64(0))
+    lasting = np.linalg.norm(session.step(turn, PLACES[0], np.float64(1e9)).force)
     assert force[-1] == pytest.approx(lasting, rel=1e-3)
     assert 1.0 < force[0] / lasting <= 2.0  # 1 + gamma of a jump
     begin = np.array([f.time for f in steps]) - steps[0].time
@@ -588,17 +592,19 @@ def test_values_go_back_into_the_file():
 
 
 def test_a_pose_is_read_whole_or_not_at_all():
-    assert read_pose(json.dumps({"pose": GOOD})).tolist() == GOOD
-    assert read_pose('"drawn"') is None
+    tool, pose = read_pose(posed(GOOD, 1), 2)
+    assert (tool, pose.tolist()) == (1, GOOD)
+    assert read_pose('"drawn"', 1) is None
     with pytest.raises(ValueError, match="too long"):
-        read_pose(" " * (LONGEST + 1))
+        read_pose(" " * (LONGEST + 1), 1)
 
 
 def test_a_frame_without_a_solution_has_no_numbers():
     none = np.zeros(3)
-    frame = Frame(PressStatus.OFF_TUBE, np.zeros(12), none, 0.0, none, 0.0, None)
-    assert len(frame.pack()) == 40
-    assert not frame.has_force
+    touch = Touch(PressStatus.OFF_TUBE, np.zeros(12), none, 0.0, none)
+    frame = Frame((touch, touch), 0.0, None)
+    assert len(frame.pack()) == 4 * (2 + 2 * 8)
+    assert not frame.has_force(1)
 
 
 def test_the_event_loop_is_left_alone_by_a_thread():

@@ -13,11 +13,13 @@ from types import SimpleNamespace
 import numpy as np
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.scene.read import SimulationFileError, read_simulation
 from jaxtrachea.scene.solids import nearest_vertices, rings_on
-from jaxtrachea.scene.stage import Scene
-from jaxtrachea.viewer.frame import Frame, packet, statuses
-from jaxtrachea.viewer.protocol import frame_of, tube_arrays, tube_of
+from jaxtrachea.scene.stage import Poses
+from jaxtrachea.viewer.frame import Frame
+from jaxtrachea.viewer.protocol import frame_of, tools_packet, tube_arrays, tube_of
+from jaxtrachea.viewer.scene import Handled
 
 HERE = Path(__file__).parent
 #: Bytes of displacements in a page at most; of a longer recording some rows are left out, evenly.
@@ -32,20 +34,18 @@ class PlayError(InputError):
     """A recording that cannot be played, and why."""
 
 
-def of_frames(scene: Scene, title: str, frames: Sequence[Frame]) -> str:
+def of_frames(handled: Handled, frames: Sequence[Frame]) -> str:
     """The page of frames that were recorded.
 
     Args:
-        scene: that they are of.
-        title: of the page.
+        handled: the scene that they are of.
         frames: in order; those without vertices are shown by their status.
 
     Raises:
         PlayError: no frame has vertices, or three.js is not installed.
     """
-    assert scene.tool is not None
-    arrays = tube_arrays(*tube_of(scene), scene.tool)
-    return _page(title, arrays, frames)
+    arrays = tube_arrays(*tube_of(handled.staged.scene))
+    return _page(handled.title, handled.names, handled.tools, arrays, frames)
 
 
 def of_file(path: Path, title: str = "") -> str:
@@ -62,36 +62,44 @@ def of_file(path: Path, title: str = "") -> str:
         stored = read_simulation(path)
     except SimulationFileError as error:
         raise PlayError.like(error) from None
-    series, rest, tool = stored.simulation, stored.rest, stored.tool
-    if isinstance(tool, dict) or isinstance(stored.path, dict):
-        raise PlayError(
-            "has several tools, and the page plays one", place=str(path),
-            cure="simulate with a single [tool]",
-        )  # fmt: skip
+    series, rest = stored.simulation, stored.rest
     if rest is None or series.vertices is None:
         raise PlayError(
             "has no surface", place=str(path), cure="simulate with surface = true in [output]"
         )
-    poses = np.zeros((len(series.status), 12))
-    if stored.path is not None:
-        poses[:, :9] = np.asarray(stored.path.rotation).reshape(-1, 9)
-        poses[:, 9:] = stored.path.translation
+    shapes = stored.tool if isinstance(stored.tool, dict) else {"tool": stored.tool}
+    paths = stored.path if isinstance(stored.path, dict) else {"tool": stored.path}
+    names, tools = list(shapes), list(shapes.values())
     where = rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)
-    arrays = tube_arrays(rest["vertices"], rest["faces"], *where, tool)
-    near = nearest_vertices(series.s, series.phi, rest)
+    near = nearest_vertices(series.s.ravel(), series.phi.ravel(), rest).reshape(-1, len(names))
+    poses = np.stack([
+        _poses(one, tool, np.asarray(series.vertices)[range(len(near)), near[:, k]])
+        for k, (tool, one) in enumerate(zip(tools, paths.values(), strict=True))
+    ], axis=1)  # fmt: skip
     frames = []
     for i, pose in enumerate(poses):
         given = {name: getattr(series, name) for name in SHOWN}
         row = {name: None if v is None else v[i] for name, v in given.items()}
-        if tool is None:
-            pose = np.concatenate([np.eye(3).ravel(), series.vertices[i, near[i]]])
-        frames.append(frame_of(tool, np.nan_to_num(pose), SimpleNamespace(**row), 0.0))
-    return _page(title or path.stem, arrays, frames, place=str(path))
+        frames.append(frame_of(tools, pose, SimpleNamespace(**row), 0.0))
+    arrays = tube_arrays(rest["vertices"], rest["faces"], *where)
+    return _page(title or path.stem, names, tools, arrays, frames, place=str(path))
+
+
+def _poses(path: Poses | None, tool: Shape | None, contact: np.ndarray) -> np.ndarray:
+    """Of one tool in every row, see `Touch`; one that cannot be seen is at its contact."""
+    found = np.zeros((len(contact), 12))
+    if path is not None:
+        found[:, :9] = np.asarray(path.rotation).reshape(-1, 9)
+        found[:, 9:] = path.translation
+    if tool is None:
+        found[:, :9], found[:, 9:] = np.eye(3).ravel(), contact
+    return np.nan_to_num(found)
 
 
 def _page(
-    title: str, arrays: dict[str, np.ndarray], frames: Sequence[Frame], place: str = ""
-) -> str:
+    title: str, names: Sequence[str], tools: Sequence[Shape | None], arrays: dict[str, np.ndarray],
+    frames: Sequence[Frame], place: str = "",
+) -> str:  # fmt: skip
     rest = arrays["rest"]
     solved = [f for f in frames if f.vertices is not None]
     if not solved:
@@ -103,12 +111,12 @@ def _page(
     step = float(abs(moves).max()) / TOP or 1.0
     arrays = arrays | {
         "heads": np.stack([f.head for f in kept]),
-        "poses": np.stack([f.pose for f in kept]).astype(np.float32),
+        "poses": np.stack([[t.pose for t in f.touches] for f in kept]).astype(np.float32),
         "moves": np.round(moves / step).astype(np.int16),
     }
-    text = {"title": title, "pose": kept[0].pose.tolist(), "statuses": statuses(), "step": step,
-            "rows": (rows + 1).tolist(), "of": len(frames)}  # fmt: skip
-    return _html(title, packet(text, arrays))
+    first = np.stack([t.pose for t in kept[0].touches])
+    more = {"step": step, "rows": (rows + 1).tolist(), "of": len(frames)}
+    return _html(title, tools_packet(title, names, tools, first, arrays, **more))
 
 
 def _html(title: str, data: bytes) -> str:

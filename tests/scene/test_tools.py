@@ -499,8 +499,6 @@ positions = [["80 mm", "16 mm", "0 mm"]]
         ('[[tool]]\nname = "left"', "[plan]\ntolerance = \"1 %\"\n[[tool]]\nname = \"left\"",
          "plan: a tolerance is for one tool"),
         ('radius = "4 mm"', 'radius = "4 mm"\nlength = "3 mm"', "length: not for shape 'sphere'"),
-        ('[[path]]\ntool = "left"', '[output]\nplay = true\n[[path]]\ntool = "left"',
-         "output.play"),
     ],
 )  # fmt: skip
 def test_tables_that_do_not_belong_together(old, new, words):
