@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 import h5py
+import jax
 import numpy as np
 import pytest
 import synthetic
@@ -28,12 +29,14 @@ from run_cli import run
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.scene.stage import Poses
 from jaxtrachea.status import PressStatus
 from jaxtrachea.viewer.frame import LONGEST, Frame, Touch, read_pose
 from jaxtrachea.viewer.live import Live
 from jaxtrachea.viewer.play import PlayError, of_file
-from jaxtrachea.viewer.scene import for_a_mouse
+from jaxtrachea.viewer.scene import for_a_mouse, read_handled
 from jaxtrachea.viewer.values import Slider, with_values
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
@@ -71,6 +74,7 @@ force_offset = { fixed = 0.0 }
 """
 CONFIGS = Path(__file__).parents[1] / "configs"
 FORCE = "document.querySelector('[data-role=force]').innerText"
+OTHERS = "document.querySelector('[data-role=others]').innerText"
 DETAIL = "document.querySelector('[data-role=detail]').innerText"
 
 
@@ -504,6 +508,43 @@ def wait_until(true, seconds):
     while not true():
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+@needs_browser
+@pytest.mark.long
+def test_several_tools_are_seen_and_moved(tmp_path):
+    """One by one by a drag and by keys; the force of each is that of `simulate` at these poses."""
+    named = SCENE.replace("[tool]\n", '[[tool]]\nname = "left"\n').replace(
+        "[[path]]\n", '[[tool]]\nname = "right"\nshape = "sphere"\nradius = "4 mm"\n'
+        '[[path]]\ntool = "right"\npositions = [["21 mm", "20 mm", "0 mm"]]\n'
+        '[[path]]\ntool = "left"\n',
+    )  # fmt: skip
+    (tmp_path / "two.toml").write_text(named)
+    places = {"left": [30.0, 16.2, 0.0], "right": [21.0, 11.0, 11.0]}
+    server, window = Server("-m", "jaxtrachea", "view", tmp_path / "two.toml", "--no-browser"), None
+    try:
+        window = Browser()
+        window.go(server.address)
+        window.wait("window.trachea?.last", 600)
+        assert window.run(OTHERS) == "right: no contact"
+        x, y = window.run("trachea.screen()")
+        _, pressed = changes(window, lambda: window.drag((x, y), (x, y + 30)))
+        assert re.fullmatch(r"F \d\.\d{4} N", pressed)
+        window.key("Digit2")
+        assert window.run(OTHERS) == f"left: {pressed}"
+        place(window, places["right"])
+        window.key("Digit1")
+        found = place(window, places["left"])[0], window.run(OTHERS)
+        assert not window.errors
+    finally:
+        server.end()
+        if window is not None:
+            window.close()
+    read = read_handled(tmp_path / "two.toml").staged
+    at = {n: Poses(np.eye(3)[None], np.array([v])) for n, v in places.items()}
+    true = jax.jit(simulate)(read.scene, read.material, at)
+    left, right = np.linalg.norm(true.force[0], axis=-1)
+    assert found == (f"F {left:.4f} N", f"right: F {right:.4f} N")
 
 
 @needs_browser
