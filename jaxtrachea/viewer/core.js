@@ -11,7 +11,6 @@ const KINDS = { float32: Float32Array, uint32: Uint32Array, uint8: Uint8Array, i
 const COLOURS = { displacement: "displacement [mm]", depth: "inward motion [mm]" };
 const PLANES = { free: "free", z: "x-y plane", y: "x-z plane", x: "y-z plane" };
 const STEP = 0.5, TURN = Math.PI / 36, FAR = 1000;
-const TOOLS = ["#d0703a", "#3a7ca5", "#8a5a9e", "#6b7f3a"]; // of the tools, one after the other
 
 export function unpack(buffer) {
   const size = new Uint32Array(buffer, 0, 1)[0];
@@ -44,11 +43,11 @@ function make(kind, parent, style = {}, text = "") {
   return e;
 }
 
-function makeTool(T, world, arrays, k) { // its picture, its force, and what it is printed with
+function makeTool(T, world, { arrays, colours }, k) { // its picture, its force, and what it is printed with
   const corners = arrays[`tool${k}`], sides = arrays[`sides${k}`], shape = new T.BufferGeometry();
   shape.setAttribute("position", new T.BufferAttribute(corners, 3));
   shape.setIndex(new T.BufferAttribute(sides, 1)); shape.computeVertexNormals();
-  const mesh = new T.Mesh(shape, new T.MeshStandardMaterial({ color: TOOLS[k % TOOLS.length], transparent: true,
+  const mesh = new T.Mesh(shape, new T.MeshStandardMaterial({ color: colours[k % colours.length], transparent: true,
     opacity: 0.45, depthWrite: false }));
   mesh.visible = corners.length > 0;
   const arrow = new T.ArrowHelper(new T.Vector3(0, 1, 0), new T.Vector3(), 10, "#c0102a", 3, 2);
@@ -102,7 +101,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     new T.MeshStandardMaterial({ color: "#1d3557" }), joints.length);
   dots.frustumCulled = false;
   world.add(mesh, ghost, dots);
-  const tools = scene.tools.map((_, k) => makeTool(T, world, scene.arrays, k));
+  const tools = scene.tools.map((_, k) => makeTool(T, world, scene, k));
   let tool = tools[0].mesh, corners = tools[0].corners; // those in hand
   const orbit = new Orbit(camera, renderer.domElement);
   let dirty = true;

@@ -13,6 +13,8 @@ from jaxtyping import Float
 
 from jaxtrachea.status import PressStatus
 
+#: Of tools, one after the other.
+COLOURS = ["#d0703a", "#3a7ca5", "#8a5a9e", "#6b7f3a"]
 #: Largest coordinate of a tool that is taken from a page, mm.
 FARTHEST = 1e4
 #: Longest message that a page may send, bytes.

@@ -10,6 +10,7 @@ from nicegui import app, ui
 from nicegui.element import Element
 from nicegui.elements.scene.scene import Scene as _Scene  # registers the module that holds three.js
 
+from jaxtrachea.viewer.frame import COLOURS
 from jaxtrachea.viewer.live import Live
 from jaxtrachea.viewer.serve import SMALL, Page, serve
 from jaxtrachea.viewer.server import Frames, add_routes
@@ -68,7 +69,8 @@ class ScenePage(Page):
                 ui.label(note).style("font-size:12px;color:#555")
             self.position()
             self.chart = ui.echart(
-                {"animation": False, "grid": {"left": 56, "right": 16, "top": 28, "bottom": 40},
+                {"animation": False, "color": COLOURS,
+                 "grid": {"left": 56, "right": 16, "top": 28, "bottom": 40},
                  "xAxis": {"type": "value", "name": "depth of the tool below the rest wall [mm]",
                            "nameLocation": "middle", "nameGap": 24},
                  "yAxis": {"type": "value", "name": "|F| [N]"},

@@ -9,7 +9,7 @@ from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.scene.solids import rings_on, tool_triangles
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.status import PressStatus
-from jaxtrachea.viewer.frame import Frame, Touch, packet, statuses
+from jaxtrachea.viewer.frame import COLOURS, Frame, Touch, packet, statuses
 
 
 def frame_of(
@@ -93,7 +93,8 @@ def tools_packet(
         corners, sides = (np.zeros((0, 3)),) * 2 if tool is None else tool_triangles(tool)
         arrays = arrays | {f"tool{k}": corners.astype(np.float32),
                            f"sides{k}": sides.astype(np.uint32)}  # fmt: skip
-    text = {"title": title, "tools": list(names), "poses": poses.tolist(), "statuses": statuses()}
+    text = {"title": title, "tools": list(names), "colours": COLOURS, "poses": poses.tolist(),
+            "statuses": statuses()}  # fmt: skip
     return packet(text | more, arrays)
 
 

@@ -1,7 +1,10 @@
 """Several tools in one scene: what each does to the others, the surface, and bad input."""
 
+import base64
 import dataclasses
 import functools
+import json
+import re
 import tomllib
 
 import h5py
@@ -255,6 +258,27 @@ def test_files_have_all_tools(tmp_path):
     np.testing.assert_array_equal(read.simulation.force, out.force)
     assert list(read.tool) == ["left", "right"]
     np.testing.assert_array_equal(read.path["right"].translation, TWO_BALLS["right"].translation)
+
+
+@pytest.mark.slow
+def test_a_page_plays_all_tools(tmp_path):
+    """The numbers of its frames, as core.js reads them."""
+    pytest.importorskip("nicegui", reason="the extra 'viewer' is not installed")
+    from jaxtrachea.viewer.play import of_file
+
+    scene, out = balls()
+    write_simulation(tmp_path / "simulation.h5", scene, SPRINGS, TWO_BALLS, out, {})
+    (page,) = re.findall('id="packet">([^<]*)<', of_file(tmp_path / "simulation.h5"))
+    data = base64.b64decode(page)
+    size = int(np.frombuffer(data, np.uint32, 1)[0])
+    text = json.loads(data[4 : 4 + size])
+    assert text["tools"] == ["left", "right"]
+    _, kind, start, count = next(a for a in text["arrays"] if a[0] == "heads")
+    touches = np.frombuffer(data, kind, count, 4 + size + start).reshape(5, -1)[:, 2:]
+    touches = touches.reshape(5, 2, 8)  # status, force, depth, point
+    np.testing.assert_array_equal(touches[..., 0], out.status)
+    np.testing.assert_allclose(touches[..., 1:4], out.force, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(touches[..., 4], np.maximum(-out.gap, 0), rtol=1e-6)
 
 
 @pytest.mark.slow
