@@ -9,14 +9,15 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.scene.read import SimulationFileError, read_simulation
-from jaxtrachea.scene.solids import nearest_vertices, rings_on
-from jaxtrachea.scene.stage import Poses
+from jaxtrachea.scene.recording import MovingTool, NoSurface, recording_of
+from jaxtrachea.scene.solids import rings_on
 from jaxtrachea.viewer.frame import Frame
 from jaxtrachea.viewer.protocol import frame_of, tools_packet, tube_arrays, tube_of
 from jaxtrachea.viewer.scene import Handled
@@ -62,38 +63,33 @@ def of_file(path: Path, title: str = "") -> str:
         stored = read_simulation(path)
     except SimulationFileError as error:
         raise PlayError.like(error) from None
+    try:
+        recorded = recording_of(stored)
+    except NoSurface as error:
+        raise PlayError.like(error, place=str(path)) from None
     series, rest = stored.simulation, stored.rest
-    if rest is None or series.vertices is None:
-        raise PlayError(
-            "has no surface", place=str(path), cure="simulate with surface = true in [output]"
-        )
+    assert rest is not None
     shapes = stored.tool if isinstance(stored.tool, dict) else {"tool": stored.tool}
-    paths = stored.path if isinstance(stored.path, dict) else {"tool": stored.path}
-    names, tools = list(shapes), list(shapes.values())
-    where = rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)
-    near = nearest_vertices(series.s.ravel(), series.phi.ravel(), rest).reshape(-1, len(names))
-    poses = np.stack([
-        _poses(one, tool, np.asarray(series.vertices)[range(len(near)), near[:, k]])
-        for k, (tool, one) in enumerate(zip(tools, paths.values(), strict=True))
-    ], axis=1)  # fmt: skip
+    tools = [shapes.get(moving.name) for moving in recorded.tools]
+    poses = np.stack([_poses(moving, series.vertices) for moving in recorded.tools], axis=1)
     frames = []
     for i, pose in enumerate(poses):
         given = {name: getattr(series, name) for name in SHOWN}
         row = {name: None if v is None else v[i] for name, v in given.items()}
         frames.append(frame_of(tools, pose, SimpleNamespace(**row), 0.0))
+    where = rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)
     arrays = tube_arrays(rest["vertices"], rest["faces"], *where)
+    names = [moving.name for moving in recorded.tools]
     return _page(title or path.stem, names, tools, arrays, frames, place=str(path))
 
 
-def _poses(path: Poses | None, tool: Shape | None, contact: np.ndarray) -> np.ndarray:
+def _poses(moving: MovingTool, walls: Any) -> np.ndarray:
     """Of one tool in every row, see `Touch`; one that cannot be seen is at its contact."""
-    found = np.zeros((len(contact), 12))
-    if path is not None:
-        found[:, :9] = np.asarray(path.rotation).reshape(-1, 9)
-        found[:, 9:] = path.translation
-    if tool is None:
-        found[:, :9], found[:, 9:] = np.eye(3).ravel(), contact
-    return np.nan_to_num(found)
+    turn, place = moving.rotation, moving.translation
+    if moving.triangles is None:
+        turn = np.broadcast_to(np.eye(3), turn.shape)
+        place = np.asarray(walls)[range(len(turn)), moving.nearest]
+    return np.nan_to_num(np.concatenate([turn.reshape(-1, 9), place], axis=1))
 
 
 def _page(
