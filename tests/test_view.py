@@ -4,14 +4,9 @@ Truth: `simulate` of the same pose; the network log of the browser; the rules of
 """
 
 import asyncio
-import contextlib
-import http.client
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
 import sys
 import threading
 import time
@@ -21,13 +16,12 @@ import h5py
 import jax
 import numpy as np
 import pytest
-import synthetic
 
 pytest.importorskip("nicegui", reason="the extra 'viewer' is not installed")
 from browser import CHROMIUM, Browser
+from page_server import Server
 from run_cli import run
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
 
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import load_scene_spec
@@ -62,16 +56,6 @@ steps = 4
 """
 #: Positions of the tool: pressed on and off the midline, clear, behind the ends of the rings.
 PLACES = np.array([[30.0, 16.2, 0.0], [21.0, 14.0, 9.0], [30.0, 25.0, 0.0], [30.0, -15.0, 0.0]])
-#: An experiment: EI_L, k_M, k_1, k_3, and its specification.
-TRUTH, DEPTHS = np.array([300.0, 1.0, 0.5, 0.2]), np.linspace(0.5, 6.0, 12)
-FIT = """[data]
-files = "curves.csv"
-[noise]
-force = "0.02 N"
-[parameters]
-onset = { fixed = 0.0 }
-force_offset = { fixed = 0.0 }
-"""
 CONFIGS = Path(__file__).parents[1] / "configs"
 FORCE = "document.querySelector('[data-role=force]').innerText"
 OTHERS = "document.querySelector('[data-role=others]').innerText"
@@ -90,64 +74,6 @@ def simulated(server):
     """Series of `simulate` of the places; with `contact_point` per_step each row is by itself."""
     with h5py.File(server.simulation) as file:
         return {name: data[()] for name, data in file["series"].items()}
-
-
-class Server:
-    """A page in a process of its own; `lines`: what it has printed."""
-
-    def __init__(self, *arguments):
-        """Start it, and wait for its address."""
-        command = [sys.executable, *map(str, arguments)]
-        env = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"}
-        self.lines = []
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
-        )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-        end = time.monotonic() + 400
-        while not (found := self._address()):
-            assert time.monotonic() < end, self.lines
-            time.sleep(0.05)
-        self.address, self.port, self.token = found.group(0), int(found[1]), found[2]
-
-    def _read(self):
-        for line in self.process.stdout:
-            self.lines.append(line)
-
-    def end(self):
-        self.process.send_signal(signal.SIGINT)
-        self.process.wait(30)
-        self._reader.join()
-        self.process.stdout.close()
-
-    def _address(self):
-        return re.search(r"http://127\.0\.0\.1:(\d+)/\?token=(\S+)", "".join(self.lines))
-
-    @property
-    def compiled(self):
-        return self.lines.count("compiled\n")
-
-    def get(self, path, **heads):
-        """Status and headers of a request."""
-        heads = {"Host": f"127.0.0.1:{self.port}", **heads}
-        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
-        link.putrequest("GET", path, skip_host=True)
-        for name, value in heads.items():
-            if value is not None:
-                link.putheader(name.replace("_", "-"), value)
-        link.endheaders()
-        with contextlib.closing(link), link.getresponse() as answer:
-            return answer.status, answer.read(), dict(answer.getheaders())
-
-    def socket(self, path="/frames", origin="own", token=None):
-        own = f"http://127.0.0.1:{self.port}"
-        mark = "&" if "?" in path else "?"
-        token = self.token if token is None else token
-        return connect(
-            f"ws://127.0.0.1:{self.port}{path}{mark}token={token}", proxy=None,
-            origin=own if origin == "own" else origin, compression=None, ping_interval=None,
-        )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -545,64 +471,6 @@ def test_several_tools_are_seen_and_moved(tmp_path):
     true = jax.jit(simulate)(read.scene, read.material, at)
     left, right = np.linalg.norm(true.force[0], axis=-1)
     assert found == (f"F {left:.4f} N", f"right: F {right:.4f} N")
-
-
-@needs_browser
-@pytest.mark.long
-def test_a_fit_sample_by_sample(tmp_path):
-    """It pauses, steps and settles; intervals shrink; the page is guarded as that of a scene."""
-    force = synthetic.forces(TRUTH[None], displacement=DEPTHS)[0][0]
-    force = force + 0.02 * np.random.default_rng(0).normal(size=force.shape)
-    presses = enumerate(zip(synthetic.S_C, force, strict=True))
-    rows = [f"T1,p{i},{s},{d},{f}" for i, (s, row) in presses
-            for d, f in zip(DEPTHS, row, strict=True)]  # fmt: skip
-    head = "specimen,trial,s_mm,displacement_mm,force_N"
-    (tmp_path / "curves.csv").write_text("\n".join([head, *rows]) + "\n")
-    (tmp_path / "fit.toml").write_text(FIT)
-    server, window = Server("-m", "jaxtrachea", "view", tmp_path / "fit.toml", "--no-browser"), None
-    try:
-        window = Browser()
-        window.go(server.address)
-        window.wait("!!document.querySelector('#play')", 400)
-        where = "document.querySelector('#where').innerText"
-        assert window.run(where).startswith("0 samples, TOO_FEW_DATA; 4 presses are there")
-        for n in (1, 2):
-            window.run("document.querySelector('#step').click()")
-            window.wait(f"{where}.startsWith('{n} samples')")
-        window.run("document.querySelector('#play').click()")
-        window.wait(f"parseInt({where}) > 30")
-        window.run("document.querySelector('#play').click()")
-        time.sleep(1)
-        count = window.run(where)
-        before = lengths(window)
-        time.sleep(1)
-        assert window.run(where) == count
-        window.run("document.querySelector('#play').click()")
-        window.wait(f"/settled/.test({where})", 60)
-        after = lengths(window)
-        assert list(after) == ["EI_L", "k_M", "k_1", "k_3"]
-        assert all(after[name][1] < before[name][1] for name in after)
-        inside = [low <= t <= high for t, (low, _, high) in zip(TRUTH, after.values(), strict=True)]
-        assert sum(inside) >= 3
-        assert not window.errors
-        hosts = {a.split("/")[2] for a in window.requests if not a.startswith(("data:", "blob:"))}
-        assert hosts == {f"127.0.0.1:{server.port}"}
-        assert server.get("/")[0] == 403
-        stranger = {"Origin": "http://evil.example"}
-        assert server.get(f"/?token={server.token}", **stranger)[0] == 403
-    finally:
-        server.end()
-        if window is not None:
-            window.close()
-    assert "Warning" not in "".join(server.lines)
-
-
-def lengths(window):
-    """Of every parameter of the table low end, length and high end of its interval."""
-    rows = window.run("document.querySelector('#estimates').innerText").splitlines()[1:]
-    cells = [row.split("\t") for row in rows]
-    ends = {c[0]: [float(v) for v in c[2].split(" to ")] for c in cells}
-    return {name: (low, high - low, high) for name, (low, high) in ends.items()}
 
 
 def test_a_scene_without_a_tool_gets_a_finger(scene_file):
