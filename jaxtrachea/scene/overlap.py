@@ -27,8 +27,8 @@ def overlapping(tools: Sequence[Shape], paths: Sequence[Poses]) -> Bool[Array, "
 
     def padded(body: Shape) -> Shape:
         """As many corners as any, the last one repeated: the same hull."""
-        more = most - body.vertices.shape[1]
-        return Shape(jnp.pad(body.vertices, ((0, 0), (0, more)), mode="edge"), body.radius)
+        corners = [body.vertices, *[body.vertices[:, -1:]] * (most - body.vertices.shape[1])]
+        return Shape(jnp.concatenate(corners, axis=1), body.radius)
 
     first, second = np.nonzero(owner[:, None] < owner)
     shapes = jax.tree.map(lambda *v: jnp.stack(v), *(padded(body) for _, body in bodies))
