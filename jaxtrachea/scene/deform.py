@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtrachea._numerics import full_precision, product
 from jaxtrachea.contact.distance import approach
 from jaxtrachea.contact.pose import Pose, inverse, transform
-from jaxtrachea.contact.search import Settings
-from jaxtrachea.contact.shapes import Shape, mean, sphere
+from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.mechanics.validation import has_solution
@@ -20,10 +19,6 @@ from jaxtrachea.scene.curve import distance_from, lay
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
-
-#: Steps from the way away from a tool's middle to the normal at a point outside of its core, where
-#: the search has one minimum: enough for sharp boxes, whose edges are reached last.
-FROM_MIDDLE = Settings(warm_steps=28)
 
 
 @full_precision
@@ -188,14 +183,10 @@ def sag(tool: Shape, pose: Poses, points):
         centre = product(pose.rotation, tool.vertices[:, 0]) + pose.translation
         off = points - centre[None]
         return jnp.maximum(jnp.sqrt(jnp.sum(off * off, axis=1)) - tool.radius, 0)
-    middle, point = mean(tool.vertices, tool.counts), sphere(jnp.zeros_like(tool.radius))
-    back = inverse(Pose(pose.rotation, pose.translation))
+    back, point = inverse(Pose(pose.rotation, pose.translation)), sphere(jnp.zeros_like(tool.radius))
 
     def one(x):
-        seen = transform(back, x[:, None])[:, 0]
-        there, away = Pose(jnp.eye(3, dtype=x.dtype), seen), seen - middle
-        length = jnp.sqrt(jnp.sum(away * away))
-        direction = jnp.where(length > 0, away / jnp.where(length > 0, length, 1), 1)
-        return approach(tool, point, there, direction, FROM_MIDDLE).distance
+        there = Pose(jnp.eye(3, dtype=x.dtype), transform(back, x[:, None])[:, 0])
+        return approach(tool, point, there).distance
 
     return jnp.maximum(jax.vmap(one)(points), 0)
