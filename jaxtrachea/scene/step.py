@@ -44,7 +44,7 @@ from jaxtrachea.scene.stage import (
     check_material,
     touch_tube,
 )
-from jaxtrachea.scene.step_together import move_tools, placed
+from jaxtrachea.scene.step_together import move_tools, placed, without_part
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.
@@ -81,14 +81,14 @@ class State(eqx.Module):
         origin: the scene that the state belongs to (static).
     """
 
-    started: Bool[Array, ""]
-    touching: Bool[Array, ""]
-    side: Int[Array, ""]
+    started: Bool[Array, "*tools"]
+    touching: Bool[Array, "*tools"]
+    side: Int[Array, "*tools"]
     last: Instant
     anchor: Anchor
     slip: Slip | None
     memory: Memory | None
-    present: Bool[Array, " tools"] | None
+    present: Bool[Array, "*tools"] | None
     origin: Origin = eqx.field(static=True)
 
 
@@ -305,7 +305,7 @@ def _start(scene: Scene, rest: History | None) -> State:
     path = Poses(jnp.eye(3, dtype=dtype)[None], jnp.zeros((1, 3), dtype))
     shapes = jax.eval_shape(touch_tube, scene_of(scene, many[0]) if many else scene, path)
     seen = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
-    seen = dataclasses.replace(seen, part=None) if many else seen
+    seen = without_part(seen) if many else seen
     no, nowhere = jnp.asarray(False), Instant(path, seen)
     state = State(
         started=no, touching=no, side=jnp.int_(Side.UNTOLD), last=nowhere,

@@ -4,11 +4,13 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import full_precision
+from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.scene.anchor import Instant
@@ -20,6 +22,11 @@ from jaxtrachea.scene.simulation import Simulation, as_simulation
 from jaxtrachea.scene.stage import Poses, Scene
 from jaxtrachea.scene.together import Together, press_together, views
 from jaxtrachea.status import PressStatus
+
+
+def without_part(seen: Touch) -> Touch:
+    """A contact of any tool, of the fields that one of a single part has."""
+    return eqx.tree_at(lambda v: v.part, seen, None, is_leaf=lambda v: v is None)
 
 
 def placed(
@@ -80,7 +87,7 @@ def move_tools(
     # One that is not present counts as clear of the wall. How a tool holds its place does not
     # depend on its shape: one program serves all.
     off = [
-        dataclasses.replace(v, part=None, gap=jnp.where(there, v.gap, 1 + jnp.abs(v.gap)))
+        eqx.tree_at(lambda v: v.gap, without_part(v), jnp.where(there, v.gap, 1 + jnp.abs(v.gap)))
         for v, there in zip(seen, present, strict=True)
     ]
     at = [whereabouts(*one) for one in zip(each, paths, off, strict=True)]
