@@ -183,7 +183,8 @@ def sag(tool: Shape, pose: Poses, points):
         centre = product(pose.rotation, tool.vertices[:, 0]) + pose.translation
         off = points - centre[None]
         return jnp.maximum(jnp.sqrt(jnp.sum(off * off, axis=1)) - tool.radius, 0)
-    back, point = inverse(Pose(pose.rotation, pose.translation)), sphere(jnp.zeros_like(tool.radius))
+    back = inverse(Pose(pose.rotation, pose.translation))
+    point = sphere(jnp.zeros_like(tool.radius))
 
     def one(x):
         there = Pose(jnp.eye(3, dtype=x.dtype), transform(back, x[:, None])[:, 0])

@@ -30,13 +30,14 @@ from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.grip import Slip, pick
 from jaxtrachea.scene.hold import hold
+from jaxtrachea.scene.in_time import Before
 from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.one_row import Row
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.rub import no_slip
-from jaxtrachea.scene.simulation import Before, Pressed, Simulation, pressed
+from jaxtrachea.scene.simulation import Pressed, Simulation, pressed
 from jaxtrachea.scene.stage import (
     Poses,
     Scene,

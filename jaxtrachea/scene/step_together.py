@@ -106,10 +106,8 @@ def move_tools(
 
     after, made, touching, known = jax.lax.map(one, (state, rows))
     there = present & touching if scene.plan.options.contact == "bonded" else present
-    ways = [
-        jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)
-    ]
-    found, moved = press_together(scene, long_run(material), paths, ways, there[None])
+    ways = [jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)]
+    found, moved, _ = press_together(scene, material, paths, ways, there[None])
     result = jax.tree.map(lambda v: v[0], as_simulation(found))
     wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
     result = result._replace(status=jnp.where(jnp.all(known), result.status, wrong))
