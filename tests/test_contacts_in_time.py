@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scenes import BARE, SPRINGS, TUBE
+from small_scenes import BALL, BARE, OUTER, SPRINGS, TUBE
 
 import jaxtrachea as jt
 from jaxtrachea.mechanics.contacts_in_time import each_at_rest, solve_in_time
@@ -189,3 +189,58 @@ def test_a_scene_of_tools_relaxes(level):
         np.testing.assert_allclose(out.force[:, j], true.force, rtol=0, atol=5e-5)
         np.testing.assert_allclose(out.depth[:, j], true.depth, rtol=0, atol=1e-3)
         np.testing.assert_array_equal(out.status[:, j], true.status)
+
+
+@pytest.mark.slow
+def test_a_session_of_tools_relaxes_as_a_path_does():
+    """And a scan is the session; a tool that is taken away leaves a wall that recovers."""
+    material = jt.RelaxingMaterial(SPRINGS, RELAXATION)
+    rows, names = len(TIME), ("left", "right")
+    turns = jnp.broadcast_to(jnp.eye(3), (rows, 3, 3))
+
+    def way(s, to):
+        return jnp.stack([np.full(rows, s), OUTER + 5.0 - WAYS[:, to], np.zeros(rows)], axis=1)
+
+    paths = {
+        name: jt.Poses(turns, way(70.0 + 10.5 * k, 2 * k), jnp.array(TIME))
+        for k, name in enumerate(names)
+    }
+    scene = jt.make_scene(TUBE, material, paths, tool=dict.fromkeys(paths, BALL), effects=BARE)
+    true = jax.device_get(jax.jit(jt.simulate)(scene, material, paths))
+    session, steps = jt.Session(scene, material), np.diff(TIME, prepend=TIME[0])
+
+    def poses(row):
+        return {name: (p.rotation[row], p.translation[row]) for name, p in paths.items()}
+
+    found = [session.step(poses(row), dt=dt) for row, dt in enumerate(steps)]
+    force = np.array([one.force for one in found])
+    # A session takes a new place where a tool comes again, some 0.01 mm beside the first.
+    first = TIME < 9.3
+    np.testing.assert_allclose(force[first], true.force[first], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(force, true.force, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal([one.status for one in found], true.status)
+    assert (true.status == PressStatus.NO_CONTACT).any(0).all()
+    with pytest.raises(ValueError, match="dt is None"):
+        session.step({})
+    kept = session.state
+
+    @jax.jit
+    def scan(state):
+
+        def move(state, row):
+            return jt.step(scene, material, state, row[0], dt=row[1])
+
+        ways = {name: (p.rotation, p.translation) for name, p in paths.items()}
+        return jax.lax.scan(move, state, (ways, steps))
+
+    state, out = scan(jt.init_state(scene, material))
+    np.testing.assert_array_equal(out.force, force)
+    jax.tree.map(np.testing.assert_array_equal, state, kept)
+    back = session.step({}, dt=np.float64(-1))
+    assert (back.status == PressStatus.BACK_IN_TIME).all()
+    jax.tree.map(np.testing.assert_array_equal, session.state, kept)
+    lifted = session.step({}, present={"left": False}, dt=np.float64(0))
+    assert lifted.force[0, 1] == 0
+    assert -lifted.skeleton[0, 1] > 0.1  # the wall has not come back yet
+    late = session.step({}, dt=np.float64(1e3))
+    assert abs(late.skeleton[0, 1]) < abs(lifted.skeleton[0, 1])

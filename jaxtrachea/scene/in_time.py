@@ -46,11 +46,19 @@ def before_path(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> B
 
 def rest_of(scene: Scene, relaxation: Relaxation) -> History:
     """The history of nothing; of several tools with an axis of them."""
-    plan = scene.plan
-    several = plan.tools != "one"
-    vector = (plan.second_plane or not plan.mechanics.hangs_on_rings) and not several
-    rest = at_rest(relaxation, plan.options, vector)
-    return each_at_rest(rest, len(scene.instruments)) if several else rest
+    plan, tools = scene.plan, len(scene.instruments)
+    vector = plan.second_plane or not plan.mechanics.hangs_on_rings
+    rest = at_rest(relaxation, plan.options, vector and not tools)
+    return each_at_rest(rest, tools) if tools else rest
+
+
+def resting(scene: Scene, material: AnyMaterial) -> History | None:
+    """The history of nothing, of one tool; None: the force does not relax."""
+    if not scene.plan.has("relaxation"):
+        return None
+    assert isinstance(material, RelaxingMaterial)
+    vector = scene.plan.second_plane and not scene.instruments
+    return at_rest(material.relaxation, scene.plan.options, vector)
 
 
 def samples_of(

@@ -133,8 +133,8 @@ class Session:
         self._numbers = jax.device_put(self._filled.copy())
         self._start = row.states.fill(state)
         pose = np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype)
-        pose += (np.zeros((), self.dtype),) if self._timed else ()
         pose = self._nowhere() if self.scene.instruments else pose
+        pose += (np.zeros((), self.dtype),) if self._timed else ()
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
 
     def _known(self, turn, place, there):
@@ -193,8 +193,9 @@ class Session:
         if self.scene.instruments or isinstance(rotation, Mapping) or present:
             given = rotation, translation, present
             pose = placed(self.scene.names, self._stands, *given, check)
-            return self._run(begin, tuple(np.array(v) for v in pose))
-        pose = check(rotation, translation)
+            pose = tuple(np.array(v) for v in pose)
+        else:
+            pose = check(rotation, translation)
         if self._timed:
             if dt is None:
                 raise ValueError(NO_TIME)
@@ -224,7 +225,7 @@ class Session:
             # Two arrays: to make one of them takes longer than it saves.
             result = self._program(*pose, self._numbers)
             if self.scene.instruments:
-                self._stands = self._known(*pose)
+                self._stands = self._known(*pose[:3])
             self._last_force = next_force(self._last_force, result)
             self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
             self._steps += 1

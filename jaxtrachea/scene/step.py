@@ -24,13 +24,13 @@ from jaxtrachea._packed import Packing
 from jaxtrachea.contact.pose import check_rotations
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
-from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
-from jaxtrachea.mechanics.press_history import History, at_rest
+from jaxtrachea.mechanics.levels.relaxing import long_run
+from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.grip import Slip, pick
 from jaxtrachea.scene.hold import hold
-from jaxtrachea.scene.in_time import Before
+from jaxtrachea.scene.in_time import Before, resting
 from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.memory import Memory
@@ -104,7 +104,7 @@ def init_state(scene: Scene, material: AnyMaterial) -> State:
         ValueError: as `Session`.
     """
     check_scene(scene, material)
-    state = _start(scene, _rest(scene, material))
+    state = _start(scene, resting(scene, material))
     return dataclasses.replace(state, origin=origin_of(scene))
 
 
@@ -161,8 +161,8 @@ def step(
         pose = tuple(jnp.stack([jnp.asarray(v) for v in of_all]) for of_all in pose)
     else:
         pose = check(rotation, translation)
-        if (dt := step_time(scene, dt)) is not None:
-            pose += (dt,)
+    if (dt := step_time(scene, dt)) is not None:
+        pose += (dt,)
     given = scene, material, state, *pose
     traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(given))
     return (_step if traced else _compiled)(*given, stiffness=stiffness)
@@ -219,6 +219,11 @@ def check_scene(scene: Scene, material: AnyMaterial, *, stiffness: bool = False)
         raise ValueError("stiffness is of one tool; expected stiffness=False for several")
     if not scene.plan.contact or (scene.tool is None and not scene.instruments):
         raise ValueError("the plan has no contact; make the scene with a path of Poses")
+    if scene.instruments and scene.plan.tools == "one":
+        raise ValueError(
+            "a mapping of one tool goes through simulate alone; expected a scene that is made with "
+            "its path and its tool by themselves"
+        )
     if not scene.plan.mechanics.stepwise:
         raise ValueError(
             "a session has no skeleton 'sections'; use simulate, or make the scene with the "
@@ -289,14 +294,6 @@ def _digest(leaves: list) -> str:
         made.update(f"{v.dtype}{v.shape}".encode())
         made.update(np.ascontiguousarray(v).tobytes())
     return made.hexdigest()
-
-
-def _rest(scene: Scene, material: AnyMaterial) -> History | None:
-    """The history of nothing; None: the force does not relax."""
-    if not scene.plan.has("relaxation"):
-        return None
-    assert isinstance(material, RelaxingMaterial)
-    return at_rest(material.relaxation, scene.plan.options, scene.plan.second_plane)
 
 
 @jax.jit
@@ -408,7 +405,7 @@ def move_tool(
     scene: Scene, material: Any, state: State, rotation, translation, dt=None
 ) -> tuple[State, Simulation, tuple[Poses, Pressed]]:
     """The next state, the result without its axis of rows, and what the surface follows from."""
-    rest, back = _rest(scene, material), None
+    rest, back = resting(scene, material), None
     if dt is not None:
         back = ~((dt >= 0) & jnp.isfinite(dt))
         dt, translation = jnp.where(back, 0, dt), jnp.where(back, jnp.nan, translation)

@@ -13,13 +13,17 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import long_run
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import Instant
+from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.grip import pick
 from jaxtrachea.scene.hold import hold
+from jaxtrachea.scene.in_time import Before, resting
 from jaxtrachea.scene.instruments import touch_together
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
+from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.simulation import Simulation, as_simulation
-from jaxtrachea.scene.stage import Poses, Scene
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.scene.together import Together, press_together, views
 from jaxtrachea.status import PressStatus
 
@@ -62,8 +66,8 @@ def placed(
     for name, pose in poses.items():
         if not isinstance(pose, tuple | list) or len(pose) != 2:
             raise ValueError(f"pose of {name!r}: expected (rotation, translation)")
-        i = names.index(name)
-        (turns[i], places[i]), there[i] = check(*pose, f"{name!r}: "), True
+        i, (turn, place) = names.index(name), pose
+        (turns[i], places[i]), there[i] = check(turn, place, f"{name!r}: "), True
     for name, is_there in present.items():
         there[names.index(name)] = is_there
     return turns, places, there
@@ -77,11 +81,16 @@ def move_tools(
     rotation: Float[Array, "m 3 3"],
     translation: Float[Array, "m 3"],
     present: Bool[Array, " m"],
+    dt: Float[Array, ""] | None = None,
 ) -> tuple[Any, Simulation, tuple[Together]]:
     """As `step.move_tool`, of all instruments; a tool that is not present is lifted off the wall.
 
     A pose that is no number takes the numbers of this step from all, and leaves its own state.
     """
+    rest, back = resting(scene, material), jnp.asarray(False)
+    if dt is not None:
+        back = ~((dt >= 0) & jnp.isfinite(dt))
+        dt, translation = jnp.where(back, 0, dt), jnp.where(back, jnp.nan, translation)
     paths = [Poses(R[None], T[None]) for R, T in zip(rotation, translation, strict=True)]
     each, seen = views(scene), touch_together(scene, paths)
     # One that is not present counts as clear of the wall. How a tool holds its place does not
@@ -100,15 +109,41 @@ def move_tools(
         at = jax.tree.map(lambda v: v[0], at)
         side = next_side(old.side, at)
         inside = (side == Side.IN_LUMEN)[None]
-        new, _, made, held = hold(view, long_run(material), old, Instant(path, touch), inside)
+        here = Instant(path, touch)
+        new, _, made, held = hold(view, long_run(material), old, here, inside, rest)
+        if new.memory is not None:
+            made = _where_pressed(made, new.memory, held.touching)
         new = pick(at.known, dataclasses.replace(new, side=side), old)
         return new, made, held.touching, at.known
 
     after, made, touching, known = jax.lax.map(one, (state, rows))
     there = present & touching if scene.plan.options.contact == "bonded" else present
     ways = [jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)]
-    found, moved, _ = press_together(scene, material, paths, ways, there[None])
+    memory, before = after.memory, None
+    if memory is not None:
+        # A history that is unknown for one is so for all.
+        lost = memory.press.lost
+        before = Before(memory.press._replace(lost=jnp.max(lost)), dt=dt)
+    found, moved, history = press_together(scene, material, paths, ways, there[None], before)
+    if memory is not None:
+        assert history is not None
+        kept = history._replace(lost=jnp.broadcast_to(history.lost, lost.shape))
+        after = dataclasses.replace(after, memory=memory._replace(press=kept))
     result = jax.tree.map(lambda v: v[0], as_simulation(found))
-    wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
-    result = result._replace(status=jnp.where(jnp.all(known), result.status, wrong))
-    return dataclasses.replace(after, present=present), result, (moved,)
+    why = jnp.where(back, PressStatus.BACK_IN_TIME, PressStatus.NON_FINITE)
+    status = jnp.where(jnp.all(known), result.status, why.astype(result.status.dtype))
+    return dataclasses.replace(after, present=present), result._replace(status=status), (moved,)
+
+
+def _where_pressed(made: Approach, memory: Memory, touching: Bool[Array, ""]) -> Approach:
+    """The way of a tool that has let go on the place it pressed, where the wall recovers.
+
+    Under the tool in the air the wall would move others from elsewhere.
+    """
+    left = ~touching & (memory.press.local.elastic != 0)
+    inward, presses = local_frame(memory.phi)[:1], made.presses
+    D = -jnp.maximum(made.own.gap, 0)[:, None] * inward
+    there = Presses(memory.s[None], memory.phi[None], D)
+    return made._replace(
+        presses=pick(left, there, presses), inward=jnp.where(left, inward, made.inward)
+    )
