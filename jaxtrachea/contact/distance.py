@@ -196,20 +196,25 @@ def approach(
     a: Shape,
     b: Shape,
     pose: Pose,
-    direction: Float[Array, "3"],
+    direction: Float[Array, "3"] | None = None,
     settings: Settings = STANDARD,
     *,
     beta: Float[Array, ""] | None = None,
 ) -> Contact:
     """Signed distance of two shapes whose cores are apart, from a direction up to 0.3 rad off.
 
-    There is one minimum then. Two steps more than `track`, and no limit to the first one.
+    There is one minimum then. Two steps more than `track`, and no limit to the first one. Where the
+    cores overlap the distance is that along some normal: it says that they do, but not how far.
 
-    The arguments are those of `track`; the direction is a unit vector.
+    The arguments are those of `track`; the direction is a unit vector. None: from one middle to the
+    other, however far off, in three times as many steps.
     """
     scaled = _scaled(a, b, pose, settings, beta)
     d, pair = jax.lax.stop_gradient((direction, scaled.pair))
-    d, _ = descend(pair, d, settings.warm_steps + 2)
+    if d is None:
+        d, _ = descend(pair, _towards(pair), 3 * settings.warm_steps)
+    else:
+        d, _ = descend(pair, d, settings.warm_steps + 2)
     return _contact(a, b, scaled, d)
 
 

@@ -55,11 +55,13 @@ class _Contacts(NamedTuple):
         law: coefficients of shape (m,).
         peak: indentation at which a law that softens stops rising, mm; inf where none does.
         width: of the smooth first touch, mm; None: bonded contacts.
+        floor: elastic force that is there where nothing presses, N; None: none.
     """
 
     law: Law
     peak: Float[Array, " m"]
     width: Float[Array, ""] | None
+    floor: Float[Array, " m"] | None = None
 
     def pressed(self, depth):
         """Indentation that enters the law, and its derivative by the depth."""
@@ -71,12 +73,15 @@ class _Contacts(NamedTuple):
     def force(self, depth):
         """Force, N. Beyond its peak a law that softens goes on level, so that none falls."""
         inside = jnp.clip(self.pressed(depth)[0], -self.peak, self.peak)
-        return self.law.force(inside)
+        force = self.law.force(inside)
+        return force if self.floor is None else jnp.maximum(force, self.floor)
 
     def tangent(self, depth):
         """Derivative of `force`, N/mm; not negative."""
         pressed, slope = self.pressed(depth)
         rising = jnp.abs(pressed) < self.peak
+        if self.floor is not None:
+            rising = rising & (self.law.force(jnp.where(rising, pressed, 0)) > self.floor)
         return jnp.where(rising, slope * self.law.tangent(jnp.where(rising, pressed, 0)), 0)
 
 
@@ -88,6 +93,7 @@ def solve(
     width: Float[Array, ""] | None = None,
     present: Bool[Array, " m"] | None = None,
     start: Float[Array, " m"] | None = None,
+    floor: Float[Array, " m"] | None = None,
 ) -> ContactForces:
     """Series coupling of m contacts: d + C F = D, each with its own law.
 
@@ -107,9 +113,13 @@ def solve(
         present: contacts that are there; the others have no force, whatever their displacement.
         start: forces to begin with, N, say of the row before; they change the number of steps, and
             the result by rounding alone.
+        floor: of unilateral contacts, elastic forces that the wall has where its tool has let go,
+            N, not negative (`contacts_in_time`); 0 if None. A contact is lifted where the force is
+            no more than that, and has its own depth under it then.
 
     Returns:
-        The `ContactForces`. LIFTED: D_j > 0, but the wall is moved away by another tool, no force.
+        The `ContactForces`. LIFTED: alone the tool would touch (D_j > 0 without a floor), but the
+        wall is moved away by another one, no force.
         NOT_CONVERGED: the numbers are too stiff against each other for their precision (k C near
         1 / epsilon); no contact has a number then, nor where one input is not finite.
     """
@@ -122,7 +132,9 @@ def solve(
     D, C = jnp.where(known, D, 0), jnp.where(known, C, 0)
     law = law._replace(**{n: jnp.where(known, k, 1) for n, k in law.coefficients().items()})
 
-    contacts = _Contacts(law, fold_depth(law), width)
+    contacts = _Contacts(law, fold_depth(law), width, floor)
+    kept = jnp.zeros_like(D) if floor is None else floor
+    own = kept if floor is None else law.root(kept, jnp.ones_like(kept), 0.0)
     alone = _pressing(D, width) * law.k_1 / (1 + jnp.diag(C) * law.k_1)
     if start is not None:
         alone = jnp.where(there & jnp.isfinite(start), start, alone)
@@ -134,15 +146,17 @@ def solve(
     # Indentations below the rounding of D, or of motions that cancel: neither is known.
     stiffness = largest(jnp.maximum(contacts.tangent(depth), law.k_1) * jnp.diag(C))
     moved = largest(product(jnp.abs(C), jnp.abs(force)))
-    known_motion = moved * eps <= 1e-4 * largest(jnp.abs(_pressing(D, width)))
+    free = own + jnp.diag(C) * kept
+    known_motion = moved * eps <= 1e-4 * largest(jnp.maximum(jnp.abs(_pressing(D, width)), free))
     balanced = (missed <= 64 * eps) & (stiffness * eps < 0.1) & known_motion
-    lifted = there & (D > 0) & (width is not None)
+    lifted = there & (D > free) & (width is not None)
     status = jnp.where(lifted, PressStatus.LIFTED, PressStatus.NO_CONTACT)
-    status = jnp.where(there & (force != 0), PressStatus.OK, status)
+    status = jnp.where(there & (force != kept), PressStatus.OK, status)
     status = jnp.where(balanced, status, PressStatus.NOT_CONVERGED)
     status = jnp.where(past, PressStatus.PAST_FOLD, status)
     status = jnp.where(known, status, PressStatus.NON_FINITE).astype(jnp.int8)
     solved = known & balanced & ~past
+    depth = depth if floor is None else jnp.where(force == floor, own, depth)
     depth, force = (jnp.where(solved, v, jnp.nan) for v in (depth, force))
     return ContactForces(depth, force, status, steps)
 
@@ -187,7 +201,8 @@ def _newton(D, C, contacts: _Contacts, start):
     none = jnp.zeros_like(start)
     begin = jnp.zeros((), int), none, none, D, jnp.full_like(size, jnp.inf)
     count, _, force, depth, missed = jax.lax.while_loop(goes, step, begin)
-    force = force if contacts.width is None else jnp.maximum(force, 0)  # not -1e-17
+    least = 0 if contacts.floor is None else contacts.floor
+    force = force if contacts.width is None else jnp.maximum(force, least)  # not -1e-17
     return depth, force, count, missed
 
 
@@ -242,14 +257,16 @@ def _follow_jvp(primals, tangents):
     root = _root(contacts.tangent(at))
     on = root > 0
     own = pressed * d_contacts.law.secant(pressed * pressed)
-    own = jnp.where(on, own, 0)
-    given = d_D - product(d_C, F)
+    own, let_go = jnp.where(on, own, 0), jnp.zeros_like(own)
+    if contacts.floor is not None:
+        let_go = jnp.where(F == contacts.floor, d_contacts.floor, 0)
+    given = d_D - product(d_C, F) - product(C, let_go)
     over = jnp.where(on, own / jnp.where(on, root, 1), 0)
     rows = jnp.stack([over + root * given, root * (given - product(C, own))], axis=1)
     z, y = _eliminate(_stiffened(C, root), rows).T
     d_force = root * z
     d_depth = jnp.where(on, y / jnp.where(on, root, 1), given - product(C, d_force))
-    return (depth, force), (d_depth, d_force)
+    return (depth, force), (d_depth, d_force + let_go)
 
 
 def _root(tangent):

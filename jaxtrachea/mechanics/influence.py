@@ -52,7 +52,7 @@ def influence(beam: Beam, s: Float[Array, " m"]) -> Influence:
         The `Influence`; differentiable in every argument. Deflection and rotation agree on both
         sides of a contact (the `continuous` split of `beam`).
     """
-    order, place = _sorted_places(s)
+    order, place = sorted_places(s)
     marked, passed, marks = with_marks(beam, picked(s, order))
     marks = marks[place]  # in the order of s
     m, supports = s.shape[0], marked.x.shape[0]
@@ -129,7 +129,7 @@ def level_influence(beam: Beam, s: Float[Array, " m"], half_width: float) -> Inf
     return Influence((C + C.T) / 2, joints, reactions, slopes, turns)
 
 
-def _sorted_places(s: Float[Array, " m"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
+def sorted_places(s: Float[Array, " m"]) -> tuple[Int[Array, " m"], Int[Array, " m"]]:
     """Indices that sort s, and the place of each entry in that order; equal ones keep theirs."""
     own = jnp.arange(s.shape[0])
     before = (s[None] < s[:, None]) | ((s[None] == s[:, None]) & (own[None] < own[:, None]))

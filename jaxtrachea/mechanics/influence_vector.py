@@ -28,6 +28,7 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import product_of_rows
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics._matrix2 import apply, solve
+from jaxtrachea.mechanics.influence import sorted_places
 from jaxtrachea.mechanics.skeleton import Rings, local_frame, needed, planes, turned_rings
 from jaxtrachea.mechanics.spatial_beam import SpatialBeam, deflect
 from jaxtrachea.trachea.geometry import Geometry
@@ -163,8 +164,8 @@ class _Strips(NamedTuple):
 
 
 def _pressed(geometry: Geometry, material: Material, s, phi, rings: Rings, shear: bool) -> _Strips:
-    order = jnp.argsort(jnp.concatenate([geometry.ring_positions, s]), stable=True)
-    places = jnp.argsort(order)  # of contacts on a ring behind it
+    # Of contacts on a ring behind it.
+    order, places = sorted_places(jnp.concatenate([geometry.ring_positions, s]))
     C = jax.vmap(lambda at: turned_rings(geometry, material, at, rings))(phi)
     beams = jax.vmap(lambda C: _strip(geometry, material, s, order, C, shear))(C)
 

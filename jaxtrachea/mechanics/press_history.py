@@ -175,12 +175,12 @@ def relax_forces(
 
     def step(history, sample):
         dt, e, status, skipped = sample
-        safe, lost, skipped = _counted(history, e, status, skipped, history.local.elastic)
+        safe, lost, skipped = counted(history, e, status, skipped, history.local.elastic)
         local, force = advance(history.local, dt, safe, samples.relaxation.local, False)
-        after = _after(history, History(local, None, lost), skipped)
+        after = remembered(history, History(local, None, lost), skipped)
         return after, (force, jnp.where(skipped, status, jnp.where(_is(lost), lost, status)))
 
-    history, (relaxed, status) = _rows(step, samples, force, status)
+    history, (relaxed, status) = run(step, samples, force, status)
     hidden = samples.skipped | ~has_solution(status)
     return jnp.where(hidden[:, None], jnp.nan, relaxed), status, history
 
@@ -201,7 +201,7 @@ def _alike(elastic, depth, law: Law, way, status, options: Options, samples: Sam
 
     def step(history, sample):
         dt, e, depth, status, skipped = sample
-        safe, lost, skipped = _counted(history, e, status, skipped, history.local.elastic)
+        safe, lost, skipped = counted(history, e, status, skipped, history.local.elastic)
         before = history.local
         local, force = advance(before, dt, safe, branches, unilateral)
         if unilateral:
@@ -209,10 +209,10 @@ def _alike(elastic, depth, law: Law, way, status, options: Options, samples: Sam
             alone = _alone(law, jnp.where(left, local.elastic, 0))
             depth = jnp.where(left, alone, depth)
         work = taken(over(dt, branches.tau), branches.gamma, before, local.elastic, way)
-        after = _after(history, History(local, None, lost), skipped)
+        after = remembered(history, History(local, None, lost), skipped)
         return after, _row(force, depth, local.elastic, work, status, lost, skipped, unilateral)
 
-    history, (solved, work) = _rows(step, samples, elastic, depth, status)
+    history, (solved, work) = run(step, samples, elastic, depth, status)
     return Relaxed(history, solved, work)
 
 
@@ -226,7 +226,7 @@ def _apart(moved, compliance, law: Law, status, options: Options, samples: Sampl
         dt, D, status, skipped = sample
         h, e = history.local
         q, y = history.skeleton
-        safe, lost, skipped = _counted(history, D, status, skipped, way(e, y))
+        safe, lost, skipped = counted(history, D, status, skipped, way(e, y))
         x, x_s = over(dt, local.tau), over(dt, skeleton.tau)
         fading = (
             factors(x, jnp.expm1(-x), local.gamma), factors(x_s, jnp.expm1(-x_s), skeleton.gamma)
@@ -244,17 +244,17 @@ def _apart(moved, compliance, law: Law, status, options: Options, samples: Sampl
         work = taken(x, local.gamma, history.local, kept[1], lambda e: _alone(law, e))
         work += taken(x_s, skeleton.gamma, history.skeleton, kept[3], lambda y: compliance * y)
         after = History(Carried(*kept[:2]), Carried(*kept[2:]), lost)
-        after = _after(history, after, skipped)
+        after = remembered(history, after, skipped)
         return after, _row(force, depth, load, work, status, lost, skipped, unilateral)
 
     def way(e, y):
         return _alone(law, e) + compliance * y
 
-    history, (solved, work) = _rows(step, samples, moved, status)
+    history, (solved, work) = run(step, samples, moved, status)
     return Relaxed(history, solved, work)
 
 
-def _rows(step, samples: Samples, *rows):
+def run(step, samples: Samples, *rows):
     """The samples in order; a single one without a loop. `step` is given dt, the rows, skipped."""
     *numbers, status = rows
     status = jnp.where(samples.status == PressStatus.OK, status, samples.status).astype(jnp.int8)
@@ -265,7 +265,7 @@ def _rows(step, samples: Samples, *rows):
     return history, jax.tree.map(lambda v: v[None], out)
 
 
-def _counted(history: History, given, status, skipped, before):
+def counted(history: History, given, status, skipped, before):
     """The input, as before where it does not count; since when the history is lost; skipped."""
     failed = ~has_solution(status) & ~skipped
     lost = jnp.where(_is(history.lost) | ~failed, history.lost, status).astype(jnp.int8)
@@ -276,7 +276,7 @@ def _is(lost):
     return lost != PressStatus.OK
 
 
-def _after(before: History, after: History, skipped) -> History:
+def remembered(before: History, after: History, skipped) -> History:
     """What is remembered; where the history is lost its numbers stay as they were."""
     stays = skipped | _is(after.lost)
     kept = jax.tree.map(

@@ -6,10 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxtrachea._numerics import WRITTEN_OUT, full_precision, product
-from jaxtrachea.contact.distance import signed_distance
+from jaxtrachea._numerics import full_precision, product
+from jaxtrachea.contact.distance import approach
 from jaxtrachea.contact.pose import Pose, inverse, transform
-from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
@@ -184,15 +183,11 @@ def sag(tool: Shape, pose: Poses, points):
         centre = product(pose.rotation, tool.vertices[:, 0]) + pose.translation
         off = points - centre[None]
         return jnp.maximum(jnp.sqrt(jnp.sum(off * off, axis=1)) - tool.radius, 0)
+    back = inverse(Pose(pose.rotation, pose.translation))
     point = sphere(jnp.zeros_like(tool.radius))
 
     def one(x):
-        back = inverse(Pose(pose.rotation, pose.translation))
-        seen = transform(back, x[:, None])[:, 0]
-        there = Pose(jnp.eye(3, dtype=x.dtype), seen)
-        return signed_distance(tool, point, there, FOR_POINTS).distance
+        there = Pose(jnp.eye(3, dtype=x.dtype), transform(back, x[:, None])[:, 0])
+        return approach(tool, point, there).distance
 
-    if tool.vertices.shape[1] > WRITTEN_OUT:
-        return jnp.maximum(jax.vmap(one)(points), 0)
-    # In turn: all at once are arrays too large for one kernel, as those of more corners are anyway.
-    return jnp.maximum(jax.lax.map(one, points), 0)
+    return jnp.maximum(jax.vmap(one)(points), 0)

@@ -257,10 +257,11 @@ def _no_company(case: Case) -> tuple[str, str] | None:
         return cannot[0], f"{cannot[1]}, {one_each}"
     if levels["skeleton"] != "linear":
         return "a skeleton softens by one contact", f"set skeleton 'linear', {one_each}"
-    if levels["relaxation"] != "off":
+    if levels["relaxation"] == "parts":
         return (
-            "a force that relaxes is derived for one contact",
-            f"set relaxation 'off' (the forces of the long run), {one_each}",
+            "parts that relax apart are derived for one contact",
+            "leave the numbers of the skeleton out, or set relaxation 'uniform' or 'off' (the "
+            f"forces of the long run), {one_each}",
         )
     return None
 

@@ -100,10 +100,11 @@ def touch_together(scene: Scene, paths: Sequence[Poses]) -> list[Touch]:
         ]
         tools, R, T = jax.tree.map(lambda *v: jnp.stack(v), *chosen)
 
-        def touched(tool, R, T, near=near, quality=quality):
+        def touched(one, near=near, quality=quality):
             assert scene.tube is not None
+            tool, R, T = one
             return touch_rows(tool, scene.tube, Poses(R, T), quality, near)
 
-        seen = jax.vmap(touched)(tools, R, T)
+        seen = jax.lax.map(touched, (tools, R, T))
         found |= {i: jax.tree.map(lambda v, k=k: v[k], seen) for k, i in enumerate(which)}
     return [found[i] for i in range(len(paths))]

@@ -68,8 +68,10 @@ class Row:
 
         # By itself it rounds alike in all programs: a scan of steps is the session to the bit.
         traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(self._scene))
-        state, contact, large, press = (line if traced else fuse(line))(state, *given)
-        lay = deform_together if self._scene.instruments else surface
+        several = bool(self._scene.instruments)
+        run = line if traced else fuse(line, products=several)
+        state, contact, large, press = run(state, *given)
+        lay = deform_together if several else surface
         vertices = lay(self._setting(*given)[0], *press) if self._shown else None
         return state, contact, large if vertices is None else (*large, vertices[0])
 

@@ -39,8 +39,9 @@ from jaxtrachea.scene.step import (
     check_state,
     init_state,
     origin_of,
+    stands_of,
 )
-from jaxtrachea.scene.step_together import States
+from jaxtrachea.scene.step_together import placed
 
 #: For what a compiled session cannot take.
 CURE = "make a new Session"
@@ -113,9 +114,7 @@ class Session:
         """
         if keep < 1:
             raise ValueError(f"keep is {keep}; expected at least 1")
-        check_scene(scene, material)
-        if stiffness and scene.instruments:
-            raise ValueError("stiffness is of one tool; expected stiffness=False for several")
+        check_scene(scene, material, stiffness=stiffness)
         self.scene, self.material, self._stiffness = scene, material, stiffness
         self.dtype = np.dtype(scene.footprint.dtype)
         self._seconds, self._steps = np.zeros(keep), 0
@@ -134,9 +133,20 @@ class Session:
         self._numbers = jax.device_put(self._filled.copy())
         self._start = row.states.fill(state)
         pose = np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype)
-        pose += (np.zeros((), self.dtype),) if self._timed else ()
         pose = self._nowhere() if self.scene.instruments else pose
+        pose += (np.zeros((), self.dtype),) if self._timed else ()
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
+
+    def _known(self, turn, place, there):
+        """Where tools stand after a step: a pose that was no number is forgotten."""
+        finite = np.isfinite(place).all(1) & np.isfinite(turn).all((1, 2))
+        if finite.all():
+            return turn, place, there
+        old = self._stands
+        return (
+            np.where(finite[:, None, None], turn, old[0]),
+            np.where(finite[:, None], place, old[1]), there,
+        )  # fmt: skip
 
     def _no_force(self) -> LastForce:
         return no_force(self.dtype, len(self.scene.instruments))
@@ -179,78 +189,50 @@ class Session:
                 where it has one tool, or one pose where it has several; the state stays as it was.
         """
         begin = time.perf_counter()
+        check = self._checked_pose
         if self.scene.instruments or isinstance(rotation, Mapping) or present:
-            stands = self._moved(rotation, translation, present)
-            return self._run(begin, stands, stands)
-        turn, place = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
-        if turn.shape != (3, 3) or place.shape != (3,):
-            raise ValueError(
-                f"rotation {turn.shape}, translation {place.shape}; expected (3, 3) and (3,)"
-            )
-        if not is_rotation(turn):
-            check_rotations("rotation", turn[None])
-        pose = turn, place
+            given = rotation, translation, present
+            pose = placed(self.scene.names, self._stands, *given, check)
+            pose = tuple(np.array(v) for v in pose)
+        else:
+            pose = check(rotation, translation)
         if self._timed:
             if dt is None:
                 raise ValueError(NO_TIME)
             if not isinstance(dt, float) and (np.ndim(dt) or isinstance(dt, str)):
                 raise ValueError(f"dt is {dt!r}; expected one number, s, as in 0.001")
-            pose = turn, place, np.asarray(dt, self.dtype)
+            pose += (np.asarray(dt, self.dtype),)
         return self._run(begin, pose)
 
-    def _moved(self, poses: Any, translation: Any, present: Mapping[str, bool]):
-        """Where several tools stand now: rotations, translations, whether they are there.
+    def _checked_pose(self, rotation, translation, of: str = "") -> tuple[np.ndarray, np.ndarray]:
+        """A pose as arrays; `of`: what it is of, as in errors.
 
         Raises:
             ValueError: see `step`.
         """
-        names = self.scene.names
-        if not names:
+        turn, place = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
+        if turn.shape != (3, 3) or place.shape != (3,):
             raise ValueError(
-                "poses by name, and the scene has one tool without a name; expected rotation and "
-                "translation, or a scene made with a mapping of paths"
+                f"{of}rotation {turn.shape}, translation {place.shape}; expected (3, 3) and (3,)"
             )
-        if not isinstance(poses, Mapping) or translation is not None:
-            raise ValueError(
-                f"one pose, and the scene has the tools {', '.join(map(repr, names))}; expected a "
-                "mapping of names to (rotation, translation)"
-            )
-        if unknown := [name for name in (*poses, *present) if name not in names]:
-            raise ValueError(
-                f"there is no tool {unknown[0]!r}; expected {', '.join(map(repr, names))}"
-            )
-        turns, places, there = (v.copy() for v in self._stands)
-        for name, pose in poses.items():
-            if not isinstance(pose, tuple | list) or len(pose) != 2:
-                raise ValueError(f"pose of {name!r}: expected (rotation, translation)")
-            turn, place = (np.asarray(v, self.dtype) for v in pose)
-            if turn.shape != (3, 3) or place.shape != (3,):
-                raise ValueError(
-                    f"{name!r}: rotation {turn.shape}, translation {place.shape}; expected (3, 3) "
-                    "and (3,)"
-                )
-            if not is_rotation(turn):
-                check_rotations(f"rotation of {name!r}", turn[None])
-            i = names.index(name)
-            turns[i], places[i], there[i] = turn, place, True
-        for name, is_there in present.items():
-            there[names.index(name)] = is_there
-        return turns, places, there
+        if not is_rotation(turn):
+            check_rotations(f"{of}rotation", turn[None])
+        return turn, place
 
-    def _run(self, begin: float, pose: tuple, stands: Any = None) -> Simulation:
+    def _run(self, begin: float, pose: tuple) -> Simulation:
         """A step of the program."""
         with self._lock:
             # Two arrays: to make one of them takes longer than it saves.
             result = self._program(*pose, self._numbers)
-            if stands is not None:
-                self._stands = stands
+            if self.scene.instruments:
+                self._stands = self._known(*pose[:3])
             self._last_force = next_force(self._last_force, result)
             self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
             self._steps += 1
         return result
 
     @property
-    def state(self) -> State | States:
+    def state(self) -> State:
         """What the next step begins with: to save, restore or branch, or to `step` on from.
 
         A state that is given back goes on to the bit as it did. The force that was held is not in
@@ -263,19 +245,14 @@ class Session:
         return dataclasses.replace(state, origin=origin_of(scene))
 
     @state.setter
-    def state(self, state: State | States) -> None:
+    def state(self, state: State) -> None:
         check_state(self.scene, state)
         own = dataclasses.replace(state, origin=self._states.like.origin)
         with self._lock:
             self._program.state = jnp.array(self._states.fill(own))
             self._last_force = self._no_force()
-            if isinstance(state, States):
-                last = [tool.last.path for tool in state.tools]
-                turns, places = (
-                    np.stack([np.asarray(v[0], self.dtype) for v in of_all])
-                    for of_all in zip(*((p.rotation, p.translation) for p in last), strict=True)
-                )
-                self._stands = turns, places, np.array(state.present)
+            if state.present is not None:
+                self._stands = tuple(np.array(v) for v in stands_of(state))
 
     def __deepcopy__(self, memo: dict) -> "Session":
         """One that goes on from the same state by the same program."""

@@ -17,18 +17,15 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
-from jaxtrachea.mechanics.press_history import History, Samples, at_rest
-from jaxtrachea.mechanics.press_in_time import validated
-from jaxtrachea.mechanics.samples import in_order
-from jaxtrachea.relaxation.filter import Relaxation
+from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.scene.approach import Approach, approach, approach_together
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
+from jaxtrachea.scene.in_time import Before, before_path, samples_of
 from jaxtrachea.scene.instruments import paths_in_order, scene_of
 from jaxtrachea.scene.programs import Moved, move
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import (
-    REFUSALS,
     hidden_rows,
     mask_rows,
     refuse,
@@ -189,7 +186,8 @@ def _together(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Press
     made: list[Approach | None] = [None] * len(paths)
     if poses := [path for path in paths if isinstance(path, Poses)]:
         made = [*approach_together(scene, poses)]
-    found, moved = press_together(scene, long_run(material), paths, made)
+    before = before_path(scene, material, paths[0])
+    found, moved, _ = press_together(scene, material, paths, made, before=before)
     vertices = deform_together(scene, moved)
     return as_simulation(found)._replace(vertices=vertices, time=paths[0].time)
 
@@ -219,34 +217,6 @@ def _simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Sim
     made = approach(scene, path) if isinstance(path, Poses) else None
     result, press = pressed(scene, material, path, made, before=before_path(scene, material, path))
     return result._replace(vertices=surface(scene, path, press), time=path.time)
-
-
-class Before(NamedTuple):
-    """What came before the rows of a force that relaxes.
-
-    Attributes:
-        history: what is remembered.
-        time: of every row, s; of a single step None.
-        dt: how long a single step takes, s; of a path None.
-    """
-
-    history: History
-    time: Float[Array, " rows"] | None = None
-    dt: Float[Array, ""] | None = None
-
-
-def before_path(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Before | None:
-    """Rest, of a force that relaxes; else None.
-
-    Raises:
-        ValueError: a path without times.
-    """
-    if not isinstance(material, RelaxingMaterial) or not scene.plan.has("relaxation"):
-        return None
-    if path.time is None:
-        raise ValueError("path.time is None; expected a time for every row: the plan relaxes")
-    vector = scene.plan.second_plane or not scene.plan.mechanics.hangs_on_rings
-    return Before(at_rest(material.relaxation, scene.plan.options, vector), path.time)
 
 
 class Pressed(NamedTuple):
@@ -292,7 +262,7 @@ def pressed(
     presses, used, inward, refused = refuse(scene, safe, given, made, bad)
     timed = ()
     if before is not None and isinstance(material, RelaxingMaterial):
-        samples, back = _samples(material.relaxation, before, presses, refused)
+        samples, back = samples_of(material.relaxation, before, presses.displacement, refused)
         refused = refused | {PressStatus.BACK_IN_TIME: back}
         D = jnp.where(back[:, None], jnp.nan, presses.displacement)
         presses, timed = Presses(presses.s, presses.phi, D), (samples,)
@@ -331,26 +301,6 @@ def pressed(
         contact_share=None if made is None else contact_share(scene, made.own),
         status=status_of(solved, share, made, refused),
     ), press
-
-
-def _samples(
-    relaxation: Relaxation, before: Before, presses: Presses, refused
-) -> tuple[Samples, Bool[Array, " rows"]]:
-    """Rows as samples of a force that relaxes, and which of them go back in time."""
-    if before.time is not None:
-        time, order = in_order(before.time, jnp.sum(presses.displacement, axis=1))
-        back = order == PressStatus.BACK_IN_TIME
-        dt = jnp.diff(time, prepend=time[:1]).astype(presses.s.dtype)
-    else:
-        assert before.dt is not None
-        dt, back = before.dt[None], jnp.zeros(1, bool)
-    relaxation, why = validated(relaxation, jnp.asarray(PressStatus.OK, jnp.int8))
-    status = jnp.broadcast_to(why, presses.s.shape)
-    for code in REFUSALS:
-        if code in refused:
-            status = jnp.where(refused[code], code, status).astype(jnp.int8)
-    skipped = back | refused[PressStatus.NON_FINITE]
-    return Samples(before.history, relaxation, dt, status, skipped), back
 
 
 @full_precision

@@ -7,6 +7,8 @@ body of `lax.scan`. `Session` is the compiled loop over it.
 import dataclasses
 import hashlib
 import weakref
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,19 +24,20 @@ from jaxtrachea._packed import Packing
 from jaxtrachea.contact.pose import check_rotations
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
-from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
-from jaxtrachea.mechanics.press_history import History, at_rest
+from jaxtrachea.mechanics.levels.relaxing import long_run
+from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.grip import Slip, pick
 from jaxtrachea.scene.hold import hold
+from jaxtrachea.scene.in_time import Before, resting
 from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.one_row import Row
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.rub import no_slip
-from jaxtrachea.scene.simulation import Before, Pressed, Simulation, pressed
+from jaxtrachea.scene.simulation import Pressed, Simulation, pressed
 from jaxtrachea.scene.stage import (
     Poses,
     Scene,
@@ -42,11 +45,11 @@ from jaxtrachea.scene.stage import (
     check_material,
     touch_tube,
 )
-from jaxtrachea.scene.step_together import States, move_tools
+from jaxtrachea.scene.step_together import move_tools, placed, without_part
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.
-STATE_VERSION = 4
+STATE_VERSION = 5
 
 
 class Origin(NamedTuple):
@@ -74,21 +77,24 @@ class State(eqx.Module):
         anchor: the place that the tool holds.
         slip: way it has slid on it; None: no friction.
         memory: of a force that relaxes; else None.
+        present: of several tools, all of whose arrays have an axis of tools first, which of them
+            are there; else None.
         origin: the scene that the state belongs to (static).
     """
 
-    started: Bool[Array, ""]
-    touching: Bool[Array, ""]
-    side: Int[Array, ""]
+    started: Bool[Array, "*tools"]
+    touching: Bool[Array, "*tools"]
+    side: Int[Array, "*tools"]
     last: Instant
     anchor: Anchor
     slip: Slip | None
     memory: Memory | None
+    present: Bool[Array, "*tools"] | None
     origin: Origin = eqx.field(static=True)
 
 
-def init_state(scene: Scene, material: AnyMaterial) -> State | States:
-    """The state before the first step: the tool was nowhere; of several tools that of each.
+def init_state(scene: Scene, material: AnyMaterial) -> State:
+    """The state before the first step: the tool was nowhere, and of several none is there.
 
     Args:
         scene: from `make_scene` with a path of `Poses`.
@@ -98,11 +104,7 @@ def init_state(scene: Scene, material: AnyMaterial) -> State | States:
         ValueError: as `Session`.
     """
     check_scene(scene, material)
-    if scene.instruments:
-        views = [scene_of(scene, instrument) for instrument in scene.instruments]
-        states = tuple(_start(view, None) for view in views)
-        return States(states, jnp.zeros(len(views), bool), origin_of(scene))
-    state = _start(scene, _rest(scene, material))
+    state = _start(scene, resting(scene, material))
     return dataclasses.replace(state, origin=origin_of(scene))
 
 
@@ -110,13 +112,14 @@ def step(
     scene: Scene,
     material: AnyMaterial,
     state: State,
-    rotation: ArrayLike,
-    translation: ArrayLike,
+    rotation: ArrayLike | Mapping[str, tuple[ArrayLike, ArrayLike]],
+    translation: ArrayLike | None = None,
     dt: ArrayLike | None = None,
     *,
+    present: Mapping[str, ArrayLike] = MappingProxyType({}),
     stiffness: bool = False,
 ) -> tuple[State, Simulation]:
-    """Move the tool: the next state, and what happens at this pose.
+    """Move the tool, or several: the next state, and what happens at this pose.
 
     It does what `Session.step` does. A pose that is not finite is a row of NaN with NON_FINITE and
     leaves the state as it was, and so does a time that runs back, with BACK_IN_TIME. Scenes of many
@@ -128,9 +131,11 @@ def step(
         material: may change from step to step.
         state: from `init_state`, or of the step before.
         rotation: of the tool, orthogonal with determinant 1 (checked where it is not traced);
-            shape (3, 3).
+            shape (3, 3). Of a scene of several tools a mapping of names to (rotation, translation),
+            as in `Session.step`.
         translation: of its origin, mm; shape (3,).
         dt: time since the step before, s; a force that relaxes needs it, nothing else reads it.
+        present: as in `Session.step`.
         stiffness: whether `Simulation.stiffness` is asked for (static): derivative of the force by
             the translation, the rest of this step as it is. Of an elastic force without friction
             it is symmetric, and of one that relaxes that of a motion within dt: with a dt that is
@@ -141,26 +146,49 @@ def step(
 
     Raises:
         ValueError: the state of another scene or version; a pose of another shape or dtype, or no
-            rotation; a material that does not fit; no dt where the force relaxes. What is traced is
-            checked by shape and dtype.
+            rotation; a material that does not fit; no dt where the force relaxes; tools that the
+            scene has not, or `stiffness` of several. What is traced is checked by shape and dtype.
     """
-    if isinstance(scene, Scene) and scene.instruments:
-        raise ValueError(
-            "scene has several tools, and step moves one; use Session.step with a mapping of poses"
-        )
-    check_scene(scene, material)
+    check_scene(scene, material, stiffness=stiffness)
     check_state(scene, state)
-    dtype = scene.footprint.dtype
-    rotation = shaped("rotation", rotation, (3, 3), why=" (one pose)")
-    translation = shaped("translation", translation, (3,), why=" (one pose)")
-    for name, v in (("rotation", rotation), ("translation", translation)):
-        if v.dtype != dtype:
-            raise ValueError(f"{name} is {v.dtype}; expected {dtype}, as the scene has")
-    if not isinstance(rotation, Tracer):
-        check_rotations("rotation", np.asarray(rotation)[None])
-    given = scene, material, state, rotation, translation, step_time(scene, dt)
+
+    def check(rotation, translation, of=""):
+        return _checked_pose(scene, rotation, translation, of)
+
+    if scene.instruments or isinstance(rotation, Mapping) or present:
+        stands = () if state.present is None else stands_of(state)
+        pose = placed(scene.names, stands, rotation, translation, present, check)
+        pose = tuple(jnp.stack([jnp.asarray(v) for v in of_all]) for of_all in pose)
+    else:
+        pose = check(rotation, translation)
+    if (dt := step_time(scene, dt)) is not None:
+        pose += (dt,)
+    given = scene, material, state, *pose
     traced = any(isinstance(v, Tracer) for v in jax.tree.leaves(given))
     return (_step if traced else _compiled)(*given, stiffness=stiffness)
+
+
+def _checked_pose(scene: Scene, rotation, translation, of: str) -> tuple[Array, Array]:
+    """A pose as arrays; `of`: what it is of, as in errors.
+
+    Raises:
+        ValueError: see `step`.
+    """
+    dtype = scene.footprint.dtype
+    rotation = shaped(f"{of}rotation", rotation, (3, 3), why=" (one pose)")
+    translation = shaped(f"{of}translation", translation, (3,), why=" (one pose)")
+    for name, v in (("rotation", rotation), ("translation", translation)):
+        if v.dtype != dtype:
+            raise ValueError(f"{of}{name} is {v.dtype}; expected {dtype}, as the scene has")
+    if not isinstance(rotation, Tracer):
+        check_rotations(f"{of}rotation", np.asarray(rotation)[None])
+    return rotation, translation
+
+
+def stands_of(state: State) -> tuple[Array, Array, Array | None]:
+    """Of a state of several tools: rotations, translations, and which of them are there."""
+    path = state.last.path
+    return path.rotation[:, 0], path.translation[:, 0], state.present
 
 
 def step_time(scene: Scene, dt: ArrayLike | None) -> Array | None:
@@ -180,15 +208,22 @@ def step_time(scene: Scene, dt: ArrayLike | None) -> Array | None:
 NO_TIME = "dt is None; expected the time since the step before, s: the force of this plan relaxes"
 
 
-def check_scene(scene: Scene, material: AnyMaterial) -> None:
+def check_scene(scene: Scene, material: AnyMaterial, *, stiffness: bool = False) -> None:
     """Refuse a scene or a material that cannot go step by step.
 
     Raises:
         ValueError: see `Session`.
     """
     check_word("scene", scene, Scene)
+    if stiffness and scene.instruments:
+        raise ValueError("stiffness is of one tool; expected stiffness=False for several")
     if not scene.plan.contact or (scene.tool is None and not scene.instruments):
         raise ValueError("the plan has no contact; make the scene with a path of Poses")
+    if scene.instruments and scene.plan.tools == "one":
+        raise ValueError(
+            "a mapping of one tool goes through simulate alone; expected a scene that is made with "
+            "its path and its tool by themselves"
+        )
     if not scene.plan.mechanics.stepwise:
         raise ValueError(
             "a session has no skeleton 'sections'; use simulate, or make the scene with the "
@@ -198,20 +233,20 @@ def check_scene(scene: Scene, material: AnyMaterial) -> None:
     check_material(scene.geometry, material)
 
 
-def check_state(scene: Scene, state: State | States) -> None:
+def check_state(scene: Scene, state: State) -> None:
     """Refuse what is no state of this scene.
 
     Raises:
         ValueError: another version, plan, dtype, or other arrays; or no state.
     """
-    check_word("state", state, States if scene.instruments else State)
+    check_word("state", state, State)
     version, plan, numbers = state.origin
     if version != STATE_VERSION:
         raise ValueError(f"state has version {version}; expected {STATE_VERSION}: begin anew")
     if plan != scene.plan:
         raise ValueError(f"state belongs to a scene of another plan: {_unlike(plan, scene.plan)}")
     dtype = scene.footprint.dtype
-    found = (state.tools[0] if isinstance(state, States) else state).anchor.point.dtype
+    found = state.anchor.point.dtype
     if found != dtype:
         raise ValueError(f"state is {found}; expected {dtype}, as the scene has")
     if numbers and digest_of(scene) not in ("", numbers):
@@ -261,28 +296,24 @@ def _digest(leaves: list) -> str:
     return made.hexdigest()
 
 
-def _rest(scene: Scene, material: AnyMaterial) -> History | None:
-    """The history of nothing; None: the force does not relax."""
-    if not scene.plan.has("relaxation"):
-        return None
-    assert isinstance(material, RelaxingMaterial)
-    return at_rest(material.relaxation, scene.plan.options, scene.plan.second_plane)
-
-
 @jax.jit
 def _start(scene: Scene, rest: History | None) -> State:
     """Before the first step."""
-    dtype = scene.footprint.dtype
+    dtype, many = scene.footprint.dtype, scene.instruments
     path = Poses(jnp.eye(3, dtype=dtype)[None], jnp.zeros((1, 3), dtype))
-    shapes = jax.eval_shape(touch_tube, scene, path)
+    shapes = jax.eval_shape(touch_tube, scene_of(scene, many[0]) if many else scene, path)
     seen = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+    seen = without_part(seen) if many else seen
     no, nowhere = jnp.asarray(False), Instant(path, seen)
-    return State(
+    state = State(
         started=no, touching=no, side=jnp.int_(Side.UNTOLD), last=nowhere,
         anchor=anchor_at(scene, nowhere), slip=no_slip(dtype) if scene.plan.friction else None,
         memory=None if rest is None else Memory(rest, jnp.zeros((), dtype), jnp.zeros((), dtype)),
-        origin=origin_of(scene),
+        present=no if many else None, origin=origin_of(scene),
     )  # fmt: skip
+    if many:
+        return jax.tree.map(lambda v: jnp.broadcast_to(v, (len(many), *v.shape)), state)
+    return state
 
 
 class Changeable(NamedTuple):
@@ -314,7 +345,7 @@ class Numbers:
         states: layout of the state.
     """
 
-    def __init__(self, scene: Scene, given: Changeable, state: State | States, *, stiffness: bool):
+    def __init__(self, scene: Scene, given: Changeable, state: State, *, stiffness: bool):
         """Lay out what changes and the state, or others of their shapes."""
         self._scene, self._stiffness = scene, stiffness
         self.given, self.states = Packing(given, weak=scene.footprint.dtype), Packing(state)
@@ -334,10 +365,7 @@ class Numbers:
         return self.states.pack(moved[0]), *moved[1:]
 
 
-def _step(
-    scene: Scene, material: AnyMaterial, state: State, rotation, translation, dt=None, *,
-    stiffness: bool = False,
-):  # fmt: skip
+def _step(scene: Scene, material: AnyMaterial, state: State, *pose, stiffness: bool = False):
     """`step`, of arguments that are checked: by the program of a `Session`.
 
     To the bit, if the scene is no argument of the compiled function: its arrays are constants there
@@ -345,13 +373,10 @@ def _step(
     """
     given = changeable(scene, material)
     numbers = Numbers(scene, given, state, stiffness=stiffness)
-    timed = () if dt is None else (dt,)
     row = Row(scene, numbers.setting, numbers.step)
     packed, result = row(
         numbers.states.pack(state),
-        rotation,
-        translation,
-        *timed,
+        *pose,
         jax.lax.optimization_barrier(numbers.given.pack(given)),
     )
     return numbers.states.unpack(packed), result
@@ -380,7 +405,7 @@ def move_tool(
     scene: Scene, material: Any, state: State, rotation, translation, dt=None
 ) -> tuple[State, Simulation, tuple[Poses, Pressed]]:
     """The next state, the result without its axis of rows, and what the surface follows from."""
-    rest, back = _rest(scene, material), None
+    rest, back = resting(scene, material), None
     if dt is not None:
         back = ~((dt >= 0) & jnp.isfinite(dt))
         dt, translation = jnp.where(back, 0, dt), jnp.where(back, jnp.nan, translation)

@@ -1,6 +1,8 @@
 """A step of several tools that feel each other: the next state of each, and what all of them do."""
 
-from typing import Any, NamedTuple
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,86 +10,144 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import full_precision
+from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import long_run
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import Instant
-from jaxtrachea.scene.approach import on_its_own
+from jaxtrachea.scene.approach import Approach, on_its_own
 from jaxtrachea.scene.grip import pick
 from jaxtrachea.scene.hold import hold
-from jaxtrachea.scene.instruments import scene_of, touch_together
+from jaxtrachea.scene.in_time import Before, resting
+from jaxtrachea.scene.instruments import touch_together
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
+from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.simulation import Simulation, as_simulation
-from jaxtrachea.scene.stage import Poses, Scene
-from jaxtrachea.scene.together import Together, press_together
+from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.scene.together import Together, press_together, views
 from jaxtrachea.status import PressStatus
 
 
-class States(eqx.Module):
-    """What the next step of several tools must know.
+def without_part(seen: Touch) -> Touch:
+    """A contact of any tool, of the fields that one of a single part has."""
+    return eqx.tree_at(lambda v: v.part, seen, None, is_leaf=lambda v: v is None)
 
-    Attributes:
-        tools: a `step.State` of each, in the order of `Scene.instruments`.
-        present: which of them were there; shape (m,).
-        origin: the scene that they belong to (static).
+
+def placed(
+    names: list[str], stands: tuple, poses: Any, translation: Any, present: Mapping[str, Any],
+    check: Callable[[Any, Any, str], tuple],
+) -> tuple[list, list, list]:  # fmt: skip
+    """Rotations and translations of several tools, and which of them are there.
+
+    Args:
+        names: of the tools.
+        stands: the same of the step before.
+        poses: mapping of names to (rotation, translation).
+        translation: None.
+        present: which of them are there from now on; one that is given a pose is.
+        check: from a rotation, a translation and what they are of, as in errors, to both as arrays.
+
+    Raises:
+        ValueError: see `Session.step`.
     """
-
-    tools: tuple[Any, ...]
-    present: Bool[Array, " m"]
-    origin: Any = eqx.field(static=True)
-
-
-class _Held(NamedTuple):
-    """A tool in this step: its next state and way; it is on its place; its pose is known."""
-
-    state: Any
-    made: Any
-    touching: Bool[Array, ""]
-    known: Bool[Array, ""]
+    if not names:
+        raise ValueError(
+            "poses by name, and the scene has one tool without a name; expected rotation and "
+            "translation, or a scene made with a mapping of paths"
+        )
+    if not isinstance(poses, Mapping) or translation is not None:
+        raise ValueError(
+            f"one pose, and the scene has the tools {', '.join(map(repr, names))}; expected a "
+            "mapping of names to (rotation, translation)"
+        )
+    if unknown := [name for name in (*poses, *present) if name not in names]:
+        raise ValueError(f"there is no tool {unknown[0]!r}; expected {', '.join(map(repr, names))}")
+    turns, places, there = map(list, stands)
+    for name, pose in poses.items():
+        if not isinstance(pose, tuple | list) or len(pose) != 2:
+            raise ValueError(f"pose of {name!r}: expected (rotation, translation)")
+        i, (turn, place) = names.index(name), pose
+        (turns[i], places[i]), there[i] = check(turn, place, f"{name!r}: "), True
+    for name, is_there in present.items():
+        there[names.index(name)] = is_there
+    return turns, places, there
 
 
 @full_precision
 def move_tools(
     scene: Scene,
     material: AnyMaterial,
-    states: States,
+    state: Any,
     rotation: Float[Array, "m 3 3"],
     translation: Float[Array, "m 3"],
     present: Bool[Array, " m"],
-) -> tuple[States, Simulation, tuple[Together]]:
+    dt: Float[Array, ""] | None = None,
+) -> tuple[Any, Simulation, tuple[Together]]:
     """As `step.move_tool`, of all instruments; a tool that is not present is lifted off the wall.
 
     A pose that is no number takes the numbers of this step from all, and leaves its own state.
     """
+    rest, back = resting(scene, material), jnp.asarray(False)
+    if dt is not None:
+        back = ~((dt >= 0) & jnp.isfinite(dt))
+        dt, translation = jnp.where(back, 0, dt), jnp.where(back, jnp.nan, translation)
     paths = [Poses(R[None], T[None]) for R, T in zip(rotation, translation, strict=True)]
-    views = [scene_of(scene, instrument) for instrument in scene.instruments]
-    each = zip(views, states.tools, paths, touch_together(scene, paths), present, strict=True)
-    held = [
-        _hold(view, material, state, path, seen, there) for view, state, path, seen, there in each
+    each, seen = views(scene), touch_together(scene, paths)
+    # One that is not present counts as clear of the wall. How a tool holds its place does not
+    # depend on its shape: one program serves all.
+    off = [
+        eqx.tree_at(lambda v: v.gap, without_part(v), jnp.where(there, v.gap, 1 + jnp.abs(v.gap)))
+        for v, there in zip(seen, present, strict=True)
     ]
-    there = present
-    if scene.plan.options.contact == "bonded":
-        there = there & jnp.stack([one.touching for one in held])
-    made = [one.made for one in held]
-    found, moved = press_together(scene, long_run(material), paths, made, there[None])
+    at = [whereabouts(*one) for one in zip(each, paths, off, strict=True)]
+    footprints = [view.footprint for view in each]
+    rows = jax.tree.map(lambda *v: jnp.stack(v), *zip(paths, off, at, footprints, strict=True))
+
+    def one(row):
+        old, (path, touch, at, footprint) = row
+        view = dataclasses.replace(each[0], footprint=footprint)
+        at = jax.tree.map(lambda v: v[0], at)
+        side = next_side(old.side, at)
+        inside = (side == Side.IN_LUMEN)[None]
+        here = Instant(path, touch)
+        if view.plan.contact_point == "per_step":
+            made = on_its_own(view, path, touch)._replace(inside=inside)
+            new = pick(at.known, dataclasses.replace(old, side=side), old)
+            return new, made, (touch.gap[0] < 0) & ~inside[0], at.known
+        new, _, made, held = hold(view, long_run(material), old, here, inside, rest)
+        if new.memory is not None:
+            made = _where_pressed(made, new.memory, held.touching)
+        new = pick(at.known, dataclasses.replace(new, side=side), old)
+        return new, made, held.touching, at.known
+
+    after, made, touching, known = jax.lax.map(one, (state, rows))
+    there = present & touching if scene.plan.options.contact == "bonded" else present
+    ways = [jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)]
+    memory, before = after.memory, None
+    if memory is not None:
+        # A history that is unknown for one is so for all.
+        lost = memory.press.lost
+        before = Before(memory.press._replace(lost=jnp.max(lost)), dt=dt)
+    found, moved, history = press_together(scene, material, paths, ways, there[None], before)
+    if memory is not None:
+        assert history is not None
+        kept = history._replace(lost=jnp.broadcast_to(history.lost, lost.shape))
+        after = dataclasses.replace(after, memory=memory._replace(press=kept))
     result = jax.tree.map(lambda v: v[0], as_simulation(found))
-    known = jnp.stack([one.known for one in held])
-    wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
-    result = result._replace(status=jnp.where(jnp.all(known), result.status, wrong))
-    after = (pick(h.known, h.state, old) for h, old in zip(held, states.tools, strict=True))
-    return States(tuple(after), present, states.origin), result, (moved,)
+    why = jnp.where(back, PressStatus.BACK_IN_TIME, PressStatus.NON_FINITE)
+    status = jnp.where(jnp.all(known), result.status, why.astype(result.status.dtype))
+    return dataclasses.replace(after, present=present), result._replace(status=status), (moved,)
 
 
-def _hold(view: Scene, material: AnyMaterial, state: Any, path: Poses, seen, present) -> _Held:
-    """One tool on its place; one that is not present counts as clear of the wall."""
-    off = eqx.tree_at(lambda v: v.gap, seen, jnp.where(present, seen.gap, 1 + jnp.abs(seen.gap)))
-    here = Instant(path, off)
-    at = jax.tree.map(lambda v: v[0], whereabouts(view, *here))
-    side = next_side(state.side, at)
-    inside = (side == Side.IN_LUMEN)[None]
-    if view.plan.contact_point == "per_step":
-        after = eqx.tree_at(lambda v: v.side, state, side)
-        made = on_its_own(view, path, off)._replace(own=seen, inside=inside)
-        return _Held(after, made, (off.gap[0] < 0) & ~inside[0], at.known)
-    after, _, made, held = hold(view, long_run(material), state, here, inside)
-    after = eqx.tree_at(lambda v: v.side, after, side)
-    return _Held(after, made._replace(own=seen), held.touching, at.known)
+def _where_pressed(made: Approach, memory: Memory, touching: Bool[Array, ""]) -> Approach:
+    """The way of a tool that has let go on the place it pressed, where the wall recovers.
+
+    Under the tool in the air the wall would move others from elsewhere.
+    """
+    left = ~touching & (memory.press.local.elastic != 0)
+    inward, presses = local_frame(memory.phi)[:1], made.presses
+    D = -jnp.maximum(made.own.gap, 0)[:, None] * inward
+    there = Presses(memory.s[None], memory.phi[None], D)
+    return made._replace(
+        presses=pick(left, there, presses), inward=jnp.where(left, inward, made.inward)
+    )

@@ -17,12 +17,16 @@ from jaxtyping import Array, Bool, Float
 from jaxtrachea._numerics import full_precision, product, product_of_rows, scaled
 from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.contacts import solve
+from jaxtrachea.mechanics.contacts_in_time import solve_in_time
 from jaxtrachea.mechanics.influence import Influence, influence, level_influence
 from jaxtrachea.mechanics.influence_vector import VectorInfluence, influence_vector
+from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond
+from jaxtrachea.mechanics.press_history import History, Samples
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene import dents, lines
 from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.in_time import Before, samples_of
 from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
@@ -68,8 +72,9 @@ def press_together(
     paths: Sequence[Poses | Presses],
     made: Sequence[Approach | None],
     present: Bool[Array, "rows m"] | None = None,
-) -> tuple[dict[str, Any], Together]:
-    """Fields of a `Simulation` but the surface, and what that follows from.
+    before: Before | None = None,
+) -> tuple[dict[str, Any], Together, History | None]:
+    """Fields of a `Simulation` but the surface, what that follows from, and what is remembered.
 
     A row in which one tool is refused has no numbers: what it does moves all others.
 
@@ -79,15 +84,21 @@ def press_together(
         paths: of the tools, all of as many rows.
         made: the way of each; None: its path is of presses.
         present: tools that are there; None: all, and those that are glued from first touch on.
+        before: of a force that relaxes; else None.
     """
     each = views(scene)
-    safe, bad = without_negative_values(scene, material)
+    safe, bad = without_negative_values(scene, long_run(material))
     given = [path if isinstance(path, Presses) else None for path in paths]
     found = [refuse(v, safe, p, m, bad) for v, p, m in zip(each, given, made, strict=True)]
     refused = {
         code: functools.reduce(jnp.logical_or, (r[code] for *_, r in found if code in r))
         for code in dict.fromkeys(code for *_, r in found for code in r)
     }
+    samples = None
+    if before is not None and isinstance(material, RelaxingMaterial):
+        ways = jnp.concatenate([p.displacement for p, *_ in found], axis=1)
+        samples, back = samples_of(material.relaxation, before, ways, refused)
+        refused[PressStatus.BACK_IN_TIME] = back
     hidden = functools.reduce(jnp.logical_or, refused.values())
     presses, used = [p for p, *_ in found], [u for _, u, *_ in found]
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
@@ -96,16 +107,20 @@ def press_together(
     unit = _influence(scene, safe, s, phi)
     if present is None and scene.plan.options.contact == "bonded":
         present = _touched(made, D)
-    depth, force, solved = _forces(scene, safe, s, unit, D, present)
+    depth, force, load, solved, history = _forces(scene, safe, s, unit, D, present, samples)
     if scene.plan.options.coupling == "total":
-        depth = jnp.where(force == 0, 0, D - product_of_rows(force, unit.compliance))
+        alone = 0 if samples is None else depth
+        depth = jnp.where(force == 0, alone, D - product_of_rows(load, unit.compliance))
+    # The shape follows the elastic force, what rings bear the force.
     if isinstance(unit, Influence):
-        does, along = lines.on_midline(unit, force, _half(scene)), lambda v: lines.anterior(-v)
+        does, bears = (lines.on_midline(unit, v, _half(scene)) for v in (load, force))
+        along = lambda v: lines.anterior(-v)  # noqa: E731
     else:
-        normals, does = jax.vmap(local_frame)(phi)[:, 0], lines.round_the_tube(unit, force)
+        does, bears = (lines.round_the_tube(unit, v) for v in (load, force))
+        normals = jax.vmap(local_frame)(phi)[:, 0]
         along = functools.partial(_along, normals)
     moved = Together(s, phi, depth, does.lines, list(made), paths, hidden)
-    rings = {"joints": does.joints, "loads": does.loads} if scene.plan.joints else {}
+    rings = {"joints": does.joints, "loads": bears.loads} if scene.plan.joints else {}
     if scene.plan.ring_ends:
         rings |= {"end_U": does.lines.U, "end_V": does.lines.V}
     vectors = {"force": along(force), "depth": along(depth), "skeleton": does.skeleton}
@@ -128,7 +143,7 @@ def press_together(
         "depth_share": stack(share),
         "contact_share": stack([contact_share(v, m.own) for v, m in zip(each, ways, strict=False)]),
         "status": _in_space(each, paths, stack(status)),
-    }, moved  # fmt: skip
+    }, moved, history  # fmt: skip
 
 
 def _in_space(each: list[Scene], paths: Sequence[Poses | Presses], status):
@@ -183,28 +198,34 @@ def _touched(made: Sequence[Approach | None], D) -> Bool[Array, "rows m"]:
     ], axis=1)  # fmt: skip
 
 
-def _forces(scene: Scene, material: Material, s, unit, D, present):
-    """Local indentations, forces and statuses of all contacts; shape (rows, m) each."""
+def _forces(scene: Scene, material: Material, s, unit, D, present, samples: Samples | None):
+    """Of all contacts local indentations, forces, elastic forces, statuses; what is remembered."""
     options = scene.plan.options
     law = jax.vmap(lambda at: local_law(scene.geometry, material, at, options))(s)
-    if scene.plan.tools == "coupled":
-        width = None
-        if options.contact == "unilateral":
-            width = jnp.asarray(options.onset_width, D.dtype)
+    width, C = None, unit.compliance
+    if options.contact == "unilateral":
+        width = jnp.asarray(options.onset_width, D.dtype)
+    coupled = scene.plan.tools == "coupled"
+    if samples is not None:
+        felt = options.coupling == "series"
+        C = C if coupled else jnp.diag(jnp.diag(C)) if felt else jnp.zeros_like(C)
+        found = solve_in_time(D, C, law, samples, width=width, present=present)
+        return found.depth, found.force, found.elastic, found.status, found.history
+    if coupled:
 
         def row(D, present):
-            return solve(D, unit.compliance, law, width=width, present=present)
+            return solve(D, C, law, width=width, present=present)
 
         found = jax.vmap(row, (0, None if present is None else 0))(D, present)
         depth = found.depth if width is None else jnp.maximum(found.depth, 0)
-        return depth, found.force, found.status
+        return depth, found.force, found.force, found.status, None
     D = D if present is None else jnp.where(present, D, 0)
 
     def alone(D, compliance, law):
         return respond(D, compliance, Contact(law, jnp.zeros_like(compliance)), options)
 
-    found = jax.vmap(alone, (1, 0, 0), 1)(D, jnp.diag(unit.compliance), law)
-    return found.depth, found.force, found.status
+    found = jax.vmap(alone, (1, 0, 0), 1)(D, jnp.diag(C), law)
+    return found.depth, found.force, found.force, found.status, None
 
 
 @full_precision

@@ -12,9 +12,10 @@ from jaxtyping import Float
 from jaxtrachea._packed import Packing
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.in_time import before_path
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.session import Session
-from jaxtrachea.scene.simulation import before_path, pressed, simulate
+from jaxtrachea.scene.simulation import pressed, simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.scene.step import check_scene
 

@@ -22,11 +22,13 @@ from jaxtrachea import (
     Presses,
     Session,
     Tool,
+    init_state,
     make_scene,
     press_contacts,
     press_contacts_oblique,
     read_simulation,
     simulate,
+    step,
 )
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.contact.shapes import box, compound, sphere
@@ -377,11 +379,31 @@ def test_a_session_pinches_as_a_path_does():
     scene = make_scene(TUBE, MATERIAL, paths, tool=dict.fromkeys(paths, BALL), effects=BARE)
     true = jax.device_get(simulate(scene, MATERIAL, paths))
     session = Session(scene, MATERIAL)
-    for row in range(4):
-        found = session.step({n: (p.rotation[row], p.translation[row]) for n, p in paths.items()})
+    steps = [
+        session.step({n: (p.rotation[row], p.translation[row]) for n, p in paths.items()})
+        for row in range(4)
+    ]
+    for row, found in enumerate(steps):
         np.testing.assert_allclose(found.force, true.force[row], rtol=0, atol=1e-13)
         np.testing.assert_allclose(found.joints, true.joints[row], rtol=0, atol=1e-13)
     lifted = session.step({}, present={"right": False})
+    rows = jax.tree.map(lambda v: v[:4], {n: (p.rotation, p.translation) for n, p in paths.items()})
+
+    @jax.jit
+    def scan(state):
+        """The same by the function: a scan, then both stay and one is lifted."""
+        state, found = jax.lax.scan(lambda *row: step(scene, MATERIAL, *row), state, rows)
+        return found, step(scene, MATERIAL, state, {}, present={"right": False})
+
+    found, (state, last) = scan(init_state(scene, MATERIAL))
+    same = jax.tree.map(lambda *v: np.stack([np.asarray(one) for one in v]), *steps, lifted)
+    found = jax.tree.map(lambda v, w: np.concatenate([v, w[None]]), found, last)
+    jax.tree.map(np.testing.assert_array_equal, found, same)
+    jax.tree.map(np.testing.assert_array_equal, state, session.state)
+    with pytest.raises(ValueError, match="no tool 'up'; expected 'left', 'right'"):
+        step(scene, MATERIAL, state, {"up": (np.eye(3), np.zeros(3))})
+    with pytest.raises(ValueError, match="stiffness is of one tool"):
+        step(scene, MATERIAL, state, {}, stiffness=True)
     assert lifted.status.tolist() == [OK, NO_CONTACT]
     assert np.linalg.norm(lifted.force[0]) < 0.7 * np.linalg.norm(true.force[-1, 0])
 
@@ -447,6 +469,11 @@ def test_tools_that_overlap_in_space():
     paths[1] = Poses(turns, other + [0, 0, 20.0])
     found = jax.jit(overlapping)([fork, sphere(2.0)], paths[:2])
     assert found.tolist() == [[True, True], [False] * 2, [True, True]]
+    # Sharp boxes of 4 mm, one deep in the other, beside it, and on its place.
+    sharp, ways = box([2.0, 2.0, 2.0]), np.array([[1.2, 0.3, 0], [4.1, 0, 0], [0, 0, 0]])
+    paths = [Poses(turns, at), Poses(turns, at + ways)]
+    found = jax.jit(overlapping)([sharp, sharp], paths)
+    assert found.tolist() == [[True, True], [False] * 2, [True, True]]
 
 
 def test_what_does_not_go_together():
@@ -491,7 +518,8 @@ def test_what_does_not_go_together():
         ({"angle": 0.5, "known": frozenset({"EA_L"})}, {"axial": "on"}, "slide on the wall"),
         ({"slip": 1.0, "along": 0.5, "friction": True}, {}, "set friction 'off'"),
         ({"known": frozenset({"sections"})}, {"contact": "bonded"}, r"give \[material\] in"),
-        ({"known": frozenset({"relaxation"}), "timed": True}, {}, "set relaxation 'off'"),
+        ({"known": frozenset({"relaxation", "relaxation.skeleton"}), "timed": True}, {},
+         "set relaxation 'uniform' or 'off'"),
         ({"known": frozenset({"e_1", "e_2"}), "way_fixed": (0.0, 0.2), "softness": (-1.4, 0.9)}, {},
          "set skeleton 'linear'"),
         ({}, {"tools": "one"}, "2 tools have a path"),
