@@ -87,7 +87,7 @@ def test_curves_without_air_keep_their_fit(mixed):
         assert result.status[lane] == plain.status[lane]
         np.testing.assert_array_equal(result.study.lanes.active[lane, P:], 0)
         np.testing.assert_allclose(
-            result.residuals.force[lane], plain.residuals.force[lane], rtol=0, atol=1e-13
+            result.residuals["force"][lane], plain.residuals["force"][lane], rtol=0, atol=1e-13
         )
     assert not np.isnan(result.table().rows[-1]["value"])
 
