@@ -398,43 +398,31 @@ def force_jacobian(
     model: FitModel,
     free: Float[Array, " Jf"],
     value: Float[Array, " J"],
-    s_c: Float[Array, ""],
-    displacement: Float[Array, " N"],
-    blend: Float[Array, ""] | None = None,
-    phi_c: Float[Array, ""] | None = None,
-    time: Float[Array, " N"] | None = None,
+    motion: Motion,
     names: tuple[str, ...] = (),
 ) -> Float[Array, "Jf m"]:
     """Derivative of the force at the load cell by the free columns, of a press without data.
 
-    Shape (Jf, N); where `phi_c` is given, after it those of `names`.
+    Shape (Jf, N); where the motion has an angle, after it those of `names`.
 
     Args:
         model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
-        s_c: mm.
-        displacement: of the tool, mm.
-        blend: rounded corner at the onset, mm, see `Lane`.
-        phi_c: contact angle, rad, the tool along the normal; None: on the midline.
-        time: of every displacement, s, where the force relaxes.
+        motion: of the tool; its onset is that of the parameters.
         names: numbers of a `Response` that are observed beside the force.
     """
     tube = _tube(model, None, free.dtype)
-    motion = Motion(s_c, displacement, blend=blend, time=time)
     if model.level.forward:
-        if phi_c is not None:
-            along = jnp.asarray([1.0, 0.0], free.dtype)
-            motion = motion._replace(phi_c=phi_c, direction=along)
-        names = () if phi_c is None else names
+        names = () if motion.phi_c is None else names
         return forward_residual.force_jacobian(model, free, value, motion, tube, names)
-    places = _Places(s_c[None], value[None], marked=False)
+    places = _Places(motion.s_c[None], value[None], marked=False)
     of_lane = _skeleton_and_derivative(model, free[None], places, tube)
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
     pressed = _press(model, tube, free, value, skeleton, by_beam, motion)
     if model.relaxes:
-        assert time is not None
-        pressed = relaxed_press(model, free, value, time, pressed)
+        assert motion.time is not None
+        pressed = relaxed_press(model, free, value, motion.time, pressed)
     return pressed.d_force + pressed.d_offset
 
 

@@ -12,6 +12,7 @@ from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.presses import HOLD_BEGINS
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.batching import PATHS
 from jaxtrachea.optimisation.programs import program
 
@@ -103,7 +104,7 @@ class Guess(NamedTuple):
     Attributes:
         theta: scaled coordinates; (P,).
         value: of all parameters, see `Lane`; (J,).
-        blend: as `force_jacobian`.
+        blend: see `Lane`; ().
         approach: how long before first touch the record begins, mm.
     """
 
@@ -167,7 +168,10 @@ def _information(model: FitModel, samples: int, names: tuple[str, ...], guess: G
     touch = values_of(model, free, value)["onset"]
     displacement = touch + share * place.depth - (1 - share) * approach
     time = None if still is None else share * (place.depth + approach) / place.speed + still
-    J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi, time, names)
+    motion = Motion(place.s, displacement, blend=blend, phi_c=place.phi, time=time)
+    if place.phi is not None:
+        motion = motion._replace(direction=jnp.asarray([1.0, 0.0], theta.dtype))
+    J = force_jacobian(model, free, value, motion, names)
     if time is not None:  # the first sample is that of rest
         J = J.reshape(len(J), -1, samples + 1)[:, :, 1:].reshape(len(J), -1)
     at = jnp.where(index >= 0, index, len(theta))
