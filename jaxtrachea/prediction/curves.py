@@ -71,9 +71,8 @@ class CurvePrediction:
         press_status: `PressStatus`; (N,).
         phi: contact angle, rad.
         direction: of the tool along the inward normal and the circumference.
-        others: what the model has beside, by field of `levels.level.Response` (of deforming
-            cross-sections `side_force`, N, and `joint_side`, mm): value, and standard error from
-            the parameters.
+        others: what the model has beside, by field of `levels.level.Response`: value, and standard
+            error from the parameters.
         model_se: standard deviation of the error of the model between the positions of the fit, N;
             (N,); 0 at one of them, and where too few tell it.
         model_quantile: of a 95 % interval in `model_se`.
