@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from run_cli import run
@@ -167,8 +168,7 @@ def test_a_study_with_further_zeros_is_as_built_from_its_records():
     expected = build._built([c for lane in study.curves for c in lane], anew)
     assert found.unknowns == expected.unknowns
     assert [lane[-1][0].name for lane in found.unknowns] == ["onset", "onset"]
-    for name, values in expected.lanes._asdict().items():
-        np.testing.assert_array_equal(getattr(found.lanes, name), values, err_msg=name)
+    jax.tree.map(np.testing.assert_array_equal, found.lanes, expected.lanes)
     np.testing.assert_array_equal(found.record_zeros, expected.record_zeros)
 
 
