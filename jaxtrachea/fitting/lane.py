@@ -1,7 +1,7 @@
 """A lane: the arrays of all that is fitted together, and what of them is observed.
 
-The residual of a trial is one row: force, side force, then what markers and ring ends show. What
-is `None` in a lane is not in the row.
+The residual of a trial is one row: the force, other numbers of a sample, then what rings show, in
+the order of `FITTED`. What is not in `Lane.others` is not in the row.
 """
 
 import math

@@ -111,6 +111,8 @@ FITTED = {
     field: tuple(q for q in OBSERVED if q.fitted == field)
     for field in dict.fromkeys(q.fitted for q in OBSERVED if q.fitted)
 }
+# There are two noises: that of the force, and that of markers.
+assert all(q.dimension == ("length" if q.rings else "force") for p in FITTED.values() for q in p)
 #: Those of one number for every sample.
 FITTED_NUMBERS = {name: parts[0] for name, parts in FITTED.items() if parts[0].rings is None}
 #: Datasets and messages number rings from 1, under names of their own.
