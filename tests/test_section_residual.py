@@ -15,6 +15,7 @@ from jaxtrachea.fitting import information, shared, structure
 from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.effective import effective_samples
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.force_share import with_shares
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.lane import (
     data_weight,
@@ -29,6 +30,7 @@ from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
 from jaxtrachea.fitting.refusals import Size, check_curve
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
 from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Shares
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.comparison import same_data
 from jaxtrachea.inference.posterior import posterior
@@ -40,6 +42,7 @@ from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMateri
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.results.store import _observed
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -328,6 +331,32 @@ def test_lanes():
     lanes = study_of([curve(PLACES[1], **only_ends)]).lanes
     assert np.sum(lanes.others["ends"].precision > 0) == 6
     assert np.sum(lanes.others["joints"].precision > 0) == 0
+
+
+def test_a_share_of_the_force_weighs_side_forces_too():
+    study = study_of([curve(PLACES[1])])
+    plain = np.asarray(study.lanes.precision)
+    found = with_shares(study, Shares(np.array([0.1]), None, plain), plain / 2).lanes
+    np.testing.assert_array_equal(found.others["side_force"].precision, plain / 2)
+    np.testing.assert_array_equal(found.others["ends"].precision[0, 0, :, 1], 1 / 0.2)
+
+
+def test_curves_of_a_stored_fit_have_what_it_read(tmp_path):
+    """Of markers and ends what has a residual; the side force as measured."""
+    n, rings, rng = 4, 3, np.random.default_rng(5)
+    joints, ends = rng.normal(size=(n, rings)), rng.normal(size=(n, rings, 2, 2))
+    left = {"joint": np.zeros((n, rings)), "end": np.zeros(ends.shape)}
+    left["joint"][:, 1], left["end"][2, 0, 1, 0] = np.nan, np.nan
+    with h5py.File(tmp_path / "data.h5", "w") as file:
+        stored = {"joints": joints, "ends": ends, "side_force": np.arange(4.0)}
+        for name, values in (stored | {f"{k}_residual": v for k, v in left.items()}).items():
+            file[name] = values
+        found = _observed(file)
+    np.testing.assert_array_equal(found["joint_displacement"], joints + left["joint"])
+    np.testing.assert_array_equal(found["end_U"], ends[:, :, 0])
+    np.testing.assert_array_equal(found["end_V"], (ends + left["end"])[:, :, 1])
+    np.testing.assert_array_equal(found["side_force"], np.arange(4.0))
+    np.testing.assert_array_equal(found["end_rings"], range(rings))
 
 
 def test_weight_of_the_data_is_that_of_all_forces():
