@@ -87,6 +87,16 @@ BOXES = [
 ]
 
 
+def test_a_start_beyond_the_bounds_ends_within():
+    """At the free minimum, which is lower than all that the box has."""
+    valley = Valley(*(np.array(column) for column in list(zip(*BOXES, strict=True))[:3]))
+    rows, starts = np.array([1, 2]), np.ones((2, 2))
+    solved = levenberg_marquardt(valley, starts, rows, batch=16)
+    assert np.all(solved.status == FitStatus.CONVERGED)
+    # A relative fall of the cost by 1e-10 is left.
+    assert np.allclose(solved.theta, [BOXES[k][3] for k in rows], rtol=0, atol=1e-5)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("count", "batch", "unoptimised"), [(1, 16, False), (1, 16, True), (1000, 64, False)]

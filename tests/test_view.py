@@ -4,36 +4,33 @@ Truth: `simulate` of the same pose; the network log of the browser; the rules of
 """
 
 import asyncio
-import contextlib
-import http.client
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
 
 import h5py
+import jax
 import numpy as np
 import pytest
-import synthetic
 
 pytest.importorskip("nicegui", reason="the extra 'viewer' is not installed")
 from browser import CHROMIUM, Browser
+from page_server import Server
 from run_cli import run
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
 
+from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.scene.stage import Poses
 from jaxtrachea.status import PressStatus
-from jaxtrachea.viewer.frame import LONGEST, Frame, read_pose
+from jaxtrachea.viewer.frame import LONGEST, Frame, Touch, read_pose
 from jaxtrachea.viewer.live import Live
 from jaxtrachea.viewer.play import PlayError, of_file
-from jaxtrachea.viewer.scene import for_a_mouse
+from jaxtrachea.viewer.scene import for_a_mouse, read_handled
 from jaxtrachea.viewer.values import Slider, with_values
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
@@ -59,18 +56,9 @@ steps = 4
 """
 #: Positions of the tool: pressed on and off the midline, clear, behind the ends of the rings.
 PLACES = np.array([[30.0, 16.2, 0.0], [21.0, 14.0, 9.0], [30.0, 25.0, 0.0], [30.0, -15.0, 0.0]])
-#: An experiment: EI_L, k_M, k_1, k_3, and its specification.
-TRUTH, DEPTHS = np.array([300.0, 1.0, 0.5, 0.2]), np.linspace(0.5, 6.0, 12)
-FIT = """[data]
-files = "curves.csv"
-[noise]
-force = "0.02 N"
-[parameters]
-onset = { fixed = 0.0 }
-force_offset = { fixed = 0.0 }
-"""
 CONFIGS = Path(__file__).parents[1] / "configs"
 FORCE = "document.querySelector('[data-role=force]').innerText"
+OTHERS = "document.querySelector('[data-role=others]').innerText"
 DETAIL = "document.querySelector('[data-role=detail]').innerText"
 
 
@@ -86,64 +74,6 @@ def simulated(server):
     """Series of `simulate` of the places; with `contact_point` per_step each row is by itself."""
     with h5py.File(server.simulation) as file:
         return {name: data[()] for name, data in file["series"].items()}
-
-
-class Server:
-    """A page in a process of its own; `lines`: what it has printed."""
-
-    def __init__(self, *arguments):
-        """Start it, and wait for its address."""
-        command = [sys.executable, *map(str, arguments)]
-        env = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"}
-        self.lines = []
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
-        )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-        end = time.monotonic() + 400
-        while not (found := self._address()):
-            assert time.monotonic() < end, self.lines
-            time.sleep(0.05)
-        self.address, self.port, self.token = found.group(0), int(found[1]), found[2]
-
-    def _read(self):
-        for line in self.process.stdout:
-            self.lines.append(line)
-
-    def end(self):
-        self.process.send_signal(signal.SIGINT)
-        self.process.wait(30)
-        self._reader.join()
-        self.process.stdout.close()
-
-    def _address(self):
-        return re.search(r"http://127\.0\.0\.1:(\d+)/\?token=(\S+)", "".join(self.lines))
-
-    @property
-    def compiled(self):
-        return self.lines.count("compiled\n")
-
-    def get(self, path, **heads):
-        """Status and headers of a request."""
-        heads = {"Host": f"127.0.0.1:{self.port}", **heads}
-        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
-        link.putrequest("GET", path, skip_host=True)
-        for name, value in heads.items():
-            if value is not None:
-                link.putheader(name.replace("_", "-"), value)
-        link.endheaders()
-        with contextlib.closing(link), link.getresponse() as answer:
-            return answer.status, answer.read(), dict(answer.getheaders())
-
-    def socket(self, path="/frames", origin="own", token=None):
-        own = f"http://127.0.0.1:{self.port}"
-        mark = "&" if "?" in path else "?"
-        token = self.token if token is None else token
-        return connect(
-            f"ws://127.0.0.1:{self.port}{path}{mark}token={token}", proxy=None,
-            origin=own if origin == "own" else origin, compression=None, ping_interval=None,
-        )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -337,13 +267,18 @@ RADIUS = 12.6
 GOOD = [1, 0, 0, 0, 1, 0, 0, 0, 1, 30, 16, 0]
 
 
+def posed(pose, tool=0, **more):
+    """A message of the page."""
+    return json.dumps({"tool": tool, "pose": pose} | more)
+
+
 @pytest.mark.long
 def test_messages_that_are_none_close_the_socket(server):
     bad = [
-        "x" * 2**20, "no JSON", '"other"', "[" * 4000, json.dumps({"pose": GOOD[:11]}),
-        json.dumps({"pose": [*GOOD[:11], 1e300]}), json.dumps({"pose": [2, *GOOD[1:]]}),
-        '{"pose": [1, 0, 0, 0, 1, 0, 0, 0, 1, 30, 16, NaN]}', json.dumps({"pose": GOOD, "more": 1}),
-        json.dumps({"pose": [True, *GOOD[1:]]}), b"\0" * 40,
+        "x" * 2**20, "no JSON", '"other"', "[" * 4000, posed(GOOD[:11]), posed([*GOOD[:11], 1e300]),
+        posed([2, *GOOD[1:]]), posed([*GOOD[:11], np.nan]), posed(GOOD, more=1), posed(GOOD, 1),
+        posed(GOOD, -1), posed(GOOD, True), json.dumps({"pose": GOOD}),
+        posed([True, *GOOD[1:]]), b"\0" * 40,
     ]  # fmt: skip
     for message in bad:
         with server.socket() as link:
@@ -367,10 +302,10 @@ def test_dragged_about_the_wall_no_row_needs_another_plan(server):
                     off = RADIUS + 5 + gap
                     pose = [*GOOD[:9], s, off * np.cos(phi), off * np.sin(phi)]
                     link.send('"drawn"')
-                    link.send(json.dumps({"pose": pose}))
+                    link.send(posed(pose))
                     head = np.frombuffer(link.recv(timeout=60)[:40], np.float32)
                     assert np.isfinite(head).all()
-                    found.append(PressStatus(int(head[0])))
+                    found.append(PressStatus(int(head[2])))
     assert len(found) == 125
     assert PressStatus.OFF_PLAN not in found
     assert found.count(PressStatus.OK) >= 75
@@ -437,8 +372,7 @@ def test_bad_input_ends_the_command(server, scene_file, tmp_path, monkeypatch, c
 
 
 #: Scenes that no hand can move, and why.
-UNMOVED = {"two_fingers": "several tools", "retractor": "several tools",
-           "cross_sections": "deforming cross-sections"}  # fmt: skip
+UNMOVED = {"cross_sections": "deforming cross-sections"}
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda p: p.stem)
@@ -471,22 +405,22 @@ def test_a_force_that_relaxes_falls_while_the_hand_rests(tmp_path):
         clear = len(live.steps)
         time.sleep(0.5)
         assert len(live.steps) == clear  # nothing changes, nothing is shown
-        pose = live.start_pose
+        pose = live.handled.poses[0].copy()
         pose[9:] = PLACES[0]
         live.move(pose)
         time.sleep(3.0)
-        steps = [f for f in live.steps if f.has_force]
+        steps = [f for f in live.steps if f.has_force(0)]
     finally:
         live.end()
         thread.join()
     assert not live.fault
-    force = np.array([np.linalg.norm(f.force) for f in steps])
+    force = np.array([np.linalg.norm(f.touches[0].force) for f in steps])
     assert len(force) > 4
     assert (np.diff(force) < 0).all()
     session = live.handled.session()
-    pose = live.start_pose[:9].reshape(3, 3)
-    session.step(pose, live.start_pose[9:], np.float64(0))
-    lasting = np.linalg.norm(session.step(pose, PLACES[0], np.float64(1e9)).force)
+    turn = np.eye(3)
+    session.step(turn, live.handled.poses[0, 9:], np.float64(0))
+    lasting = np.linalg.norm(session.step(turn, PLACES[0], np.float64(1e9)).force)
     assert force[-1] == pytest.approx(lasting, rel=1e-3)
     assert 1.0 < force[0] / lasting <= 2.0  # 1 + gamma of a jump
     begin = np.array([f.time for f in steps]) - steps[0].time
@@ -504,60 +438,39 @@ def wait_until(true, seconds):
 
 @needs_browser
 @pytest.mark.long
-def test_a_fit_sample_by_sample(tmp_path):
-    """It pauses, steps and settles; intervals shrink; the page is guarded as that of a scene."""
-    force = synthetic.forces(TRUTH[None], displacement=DEPTHS)[0][0]
-    force = force + 0.02 * np.random.default_rng(0).normal(size=force.shape)
-    presses = enumerate(zip(synthetic.S_C, force, strict=True))
-    rows = [f"T1,p{i},{s},{d},{f}" for i, (s, row) in presses
-            for d, f in zip(DEPTHS, row, strict=True)]  # fmt: skip
-    head = "specimen,trial,s_mm,displacement_mm,force_N"
-    (tmp_path / "curves.csv").write_text("\n".join([head, *rows]) + "\n")
-    (tmp_path / "fit.toml").write_text(FIT)
-    server, window = Server("-m", "jaxtrachea", "view", tmp_path / "fit.toml", "--no-browser"), None
+def test_several_tools_are_seen_and_moved(tmp_path):
+    """One by one by a drag and by keys; the force of each is that of `simulate` at these poses."""
+    named = SCENE.replace("[tool]\n", '[[tool]]\nname = "left"\n').replace(
+        "[[path]]\n", '[[tool]]\nname = "right"\nshape = "sphere"\nradius = "4 mm"\n'
+        '[[path]]\ntool = "right"\npositions = [["21 mm", "20 mm", "0 mm"]]\n'
+        '[[path]]\ntool = "left"\n',
+    )  # fmt: skip
+    (tmp_path / "two.toml").write_text(named)
+    places = {"left": [30.0, 16.2, 0.0], "right": [21.0, 11.0, 11.0]}
+    server, window = Server("-m", "jaxtrachea", "view", tmp_path / "two.toml", "--no-browser"), None
     try:
         window = Browser()
         window.go(server.address)
-        window.wait("!!document.querySelector('#play')", 400)
-        where = "document.querySelector('#where').innerText"
-        assert window.run(where).startswith("0 samples, TOO_FEW_DATA; 4 presses are there")
-        for n in (1, 2):
-            window.run("document.querySelector('#step').click()")
-            window.wait(f"{where}.startsWith('{n} samples')")
-        window.run("document.querySelector('#play').click()")
-        window.wait(f"parseInt({where}) > 30")
-        window.run("document.querySelector('#play').click()")
-        time.sleep(1)
-        count = window.run(where)
-        before = lengths(window)
-        time.sleep(1)
-        assert window.run(where) == count
-        window.run("document.querySelector('#play').click()")
-        window.wait(f"/settled/.test({where})", 60)
-        after = lengths(window)
-        assert list(after) == ["EI_L", "k_M", "k_1", "k_3"]
-        assert all(after[name][1] < before[name][1] for name in after)
-        inside = [low <= t <= high for t, (low, _, high) in zip(TRUTH, after.values(), strict=True)]
-        assert sum(inside) >= 3
+        window.wait("window.trachea?.last", 600)
+        assert window.run(OTHERS) == "right: no contact"
+        x, y = window.run("trachea.screen()")
+        _, pressed = changes(window, lambda: window.drag((x, y), (x, y + 30)))
+        assert re.fullmatch(r"F \d\.\d{4} N", pressed)
+        window.key("Digit2")
+        assert window.run(OTHERS) == f"left: {pressed}"
+        place(window, places["right"])
+        window.key("Digit1")
+        found = place(window, places["left"])[0], window.run(OTHERS)
         assert not window.errors
-        hosts = {a.split("/")[2] for a in window.requests if not a.startswith(("data:", "blob:"))}
-        assert hosts == {f"127.0.0.1:{server.port}"}
-        assert server.get("/")[0] == 403
-        stranger = {"Origin": "http://evil.example"}
-        assert server.get(f"/?token={server.token}", **stranger)[0] == 403
     finally:
         server.end()
         if window is not None:
             window.close()
-    assert "Warning" not in "".join(server.lines)
-
-
-def lengths(window):
-    """Of every parameter of the table low end, length and high end of its interval."""
-    rows = window.run("document.querySelector('#estimates').innerText").splitlines()[1:]
-    cells = [row.split("\t") for row in rows]
-    ends = {c[0]: [float(v) for v in c[2].split(" to ")] for c in cells}
-    return {name: (low, high - low, high) for name, (low, high) in ends.items()}
+    read = read_handled(tmp_path / "two.toml").staged
+    at = {n: Poses(np.eye(3)[None], np.array([v])) for n, v in places.items()}
+    true = jax.jit(simulate)(read.scene, read.material, at)
+    left, right = np.linalg.norm(true.force[0], axis=-1)
+    assert found == (f"F {left:.4f} N", f"right: F {right:.4f} N")
 
 
 def test_a_scene_without_a_tool_gets_a_finger(scene_file):
@@ -588,17 +501,19 @@ def test_values_go_back_into_the_file():
 
 
 def test_a_pose_is_read_whole_or_not_at_all():
-    assert read_pose(json.dumps({"pose": GOOD})).tolist() == GOOD
-    assert read_pose('"drawn"') is None
+    tool, pose = read_pose(posed(GOOD, 1), 2)
+    assert (tool, pose.tolist()) == (1, GOOD)
+    assert read_pose('"drawn"', 1) is None
     with pytest.raises(ValueError, match="too long"):
-        read_pose(" " * (LONGEST + 1))
+        read_pose(" " * (LONGEST + 1), 1)
 
 
 def test_a_frame_without_a_solution_has_no_numbers():
     none = np.zeros(3)
-    frame = Frame(PressStatus.OFF_TUBE, np.zeros(12), none, 0.0, none, 0.0, None)
-    assert len(frame.pack()) == 40
-    assert not frame.has_force
+    touch = Touch(PressStatus.OFF_TUBE, np.zeros(12), none, 0.0, none)
+    frame = Frame((touch, touch), 0.0, None)
+    assert len(frame.pack()) == 4 * (2 + 2 * 8)
+    assert not frame.has_force(1)
 
 
 def test_the_event_loop_is_left_alone_by_a_thread():

@@ -65,14 +65,6 @@ def _content(file: Path) -> dict:
         content = read_tables(file, "scene")
     except SpecError as error:
         raise Stop(str(error)) from None
-    legs = content.get("path", [])
-    legs = legs if isinstance(legs, list) else [legs]
-    named = any(isinstance(leg, dict) and "tool" in leg for leg in legs)
-    if isinstance(content.get("tool"), list) or named:
-        raise Stop(
-            f"{file}: tool: several tools, and the page moves one; give a single [tool], or see "
-            f"them by jaxtrachea simulate {file} (pictures; vtk and animation in [output])"
-        )
     for name in ("wall", "sections"):
         if name in content and "data" not in content:
             raise Stop(

@@ -13,6 +13,7 @@ from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.evaluate import evaluated
 from jaxtrachea.fitting.force_share import (
     MAX_ITERATIONS,
+    Levels,
     changed,
     next_levels,
     with_found_shares,
@@ -143,25 +144,27 @@ class _Found(NamedTuple):
 def _with_force_share(found: _Found, settings: Settings, progress) -> _Found:
     """The fit in turns with sigma and share of its forces, until these stay.
 
-    Lanes whose residuals show no share are left as they are.
+    Lanes whose residuals show no share are left as they are. A lane that is not fitted again keeps
+    the weights that it was fitted with.
     """
     alive = None if progress is None else lambda done, of: progress(0, of)
     result, minima, known = found
     levels = None
     for _ in range(MAX_ITERATIONS):
-        before = levels
-        levels, force = next_levels(result)
-        rows = changed(before, levels)
+        wanted, force = next_levels(result)
+        rows = changed(levels, wanted)
         if result.study.joint and len(rows):
             rows = np.arange(result.lanes)
         if not len(rows):
-            if before is None:  # refits need not look again
+            if levels is None:  # refits need not look again
                 none = dataclasses.replace(result.study, force_share=None)
                 result = dataclasses.replace(result, study=none)
             break
         _log.info("%d fits again with a share of the force in the noise", len(rows))
-        study = with_levels(result.study, levels, force)
-        part = study if len(rows) == result.lanes else study.take(rows)
+        new = Levels(*(v[rows] for v in wanted))
+        levels = wanted if levels is None else levels.replaced(rows, new)
+        part = with_levels(result.study.take(rows), new, force[rows])
+        study = with_found_shares(found.result.study, result.study, rows, part)
         again = _lowest(part, settings, alive, None, result.theta[rows])
         minima = minima.without_ends(rows).replaced(rows, again.minima)
         result = _conclude(study, minima, known)

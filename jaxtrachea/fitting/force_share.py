@@ -33,6 +33,10 @@ class Levels(NamedTuple):
     sigma: Float[np.ndarray, " lanes"]
     share: Float[np.ndarray, " lanes"]
 
+    def replaced(self, rows: Int[np.ndarray, " n"], by: "Levels") -> "Levels":
+        """With other rows."""
+        return Levels(*(_replaced(old, rows, new) for old, new in zip(self, by, strict=True)))
+
 
 def with_levels(study: Study, levels: Levels, force: Float[np.ndarray, "lanes T N"]) -> Study:
     """The study with forces weighed by sigma and share; `force` without offset, N."""

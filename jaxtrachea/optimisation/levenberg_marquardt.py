@@ -91,7 +91,7 @@ def levenberg_marquardt(
 
     Args:
         objective: of all lanes: numpy arrays with a leading axis.
-        starts: scaled coordinates; (starts, P).
+        starts: scaled coordinates; (starts, P). One outside of the box begins on its bounds.
         rows: lane of each start, int; (starts,); None: one start of each lane.
         tolerances: when a start is done.
         batch: starts computed together at most; one alone takes a place among a few, unless this
@@ -106,7 +106,8 @@ def levenberg_marquardt(
     total, unknowns = starts.shape
     rows = np.arange(total) if rows is None else rows
     batch = batch_size(max(total, 2), batch)
-    exact, objective, given = objective, cast(objective, dtype), cast(starts, dtype)
+    exact, objective = objective, cast(objective, dtype)
+    given = np.clip(cast(starts, dtype), objective.lower[rows], objective.upper[rows])
     advance = program(_advance, tolerances, ROUNDS, axes=None, donate=(3,), unoptimised=unoptimised)
     state = _idle(objective, batch, dtype)
     # What the slots of the batch compute with; rewritten only where a start takes its place.

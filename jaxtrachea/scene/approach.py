@@ -48,16 +48,17 @@ class Approach(NamedTuple):
 def approach(scene: Scene, path: Poses) -> Approach:
     """Let the tool touch the tube at rest, and say what it does to the place it touches."""
     if scene.plan.contact_point == "per_step":
-        return _on_its_own(scene, path)
+        return _with_pull(scene, path)
     return _on_first_touch(scene, path, touch_tube(scene, path))
 
 
 @full_precision
 def approach_together(scene: Scene, paths: Sequence[Poses]) -> list[Approach]:
-    """As `approach`, of all instruments of a scene; each keeps its place."""
+    """As `approach`, of all instruments of a scene; without `pull`."""
+    made = on_its_own if scene.plan.contact_point == "per_step" else _on_first_touch
     views = [scene_of(scene, instrument) for instrument in scene.instruments]
     each = zip(views, paths, touch_together(scene, paths), strict=True)
-    return [_on_first_touch(*one) for one in each]
+    return [made(*one) for one in each]
 
 
 def _on_first_touch(scene: Scene, path: Poses, seen: Touch) -> Approach:
@@ -66,18 +67,23 @@ def _on_first_touch(scene: Scene, path: Poses, seen: Touch) -> Approach:
     return on_one_point(scene, path, seen, first_touch(seen, inside)[1], inside)
 
 
-def _on_its_own(scene: Scene, path: Poses) -> Approach:
+def _with_pull(scene: Scene, path: Poses) -> Approach:
     """Every row as a press along the normal where it touches."""
 
     def pressed(path):
-        seen = touch_tube(scene, path)
-        inward, frame = _directions(scene, seen)
-        return Presses(seen.s, seen.phi, -seen.gap[:, None] * inward), (seen, inward, frame)
+        made = on_its_own(scene, path, touch_tube(scene, path))
+        return made.presses, made
 
-    presses, pull, (seen, inward, frame) = jax.vjp(pressed, path, has_aux=True)
+    _, pull, made = jax.vjp(pressed, path, has_aux=True)
+    return made._replace(pull=pull)
+
+
+def on_its_own(scene: Scene, path: Poses, seen: Touch) -> Approach:
+    """Every row as a press along the normal where it touches; without `pull`."""
+    inward, frame = _directions(scene, seen)
     return Approach(
-        seen=seen, presses=presses, inward=inward, first=None, frame=frame, own=seen,
-        inside=in_lumen(scene, path, seen), pull=pull,
+        seen=seen, presses=Presses(seen.s, seen.phi, -seen.gap[:, None] * inward), inward=inward,
+        first=None, frame=frame, own=seen, inside=in_lumen(scene, path, seen),
     )  # fmt: skip
 
 

@@ -253,11 +253,6 @@ def _no_company(case: Case) -> tuple[str, str] | None:
             "deforming cross-sections are derived for one contact",
             f"give [material] in the place of [sections] and [wall], {one_each}",
         )
-    if levels["contact_point"] != "fixed":
-        return (
-            "a tool does not keep its place (contact_point 'per_step')",
-            f"shorten its path along the surface, or set contact_point 'fixed', {one_each}",
-        )
     if levels["second_plane"] != "off" and (cannot := _no_lines(case)):
         return cannot[0], f"{cannot[1]}, {one_each}"
     if levels["skeleton"] != "linear":
@@ -276,11 +271,11 @@ def _no_lines(case: Case) -> tuple[str, str] | None:
     if levels["friction"] == "on":
         off = "set friction 'off' and contact_point 'fixed'"
         return "friction is derived for one tool", off
-    if case.facts.drags:
+    if case.facts.drags and case.prescribed:
         return (
             "one of them moves along the wall by more than a twentieth of its way: what it drags "
             "along needs friction, which is derived for one tool",
-            "press straight in",
+            "press straight in, or set contact_point 'per_step' (frictionless)",
         )
     if case.options.contact == "bonded":
         return (

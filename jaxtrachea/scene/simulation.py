@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import full_precision
+from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.press_history import History, Samples, at_rest
@@ -173,6 +174,18 @@ def _of_tools(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Press
     if scene.plan.tools == "one":
         alone = _simulate(scene_of(scene, scene.instruments[0]), material, paths[0])
         return with_axis(alone)
+    if scene.plan.contact_point == "per_step":  # each row is by itself
+
+        def row(paths):
+            alone = _together(scene, material, jax.tree.map(lambda v: v[None], paths))
+            return jax.tree.map(lambda v: v[0], alone)
+
+        return one_by_one(row, paths)
+    return _together(scene, material, paths)
+
+
+def _together(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Presses]) -> Simulation:
+    """Several tools, each on one place."""
     made: list[Approach | None] = [None] * len(paths)
     if poses := [path for path in paths if isinstance(path, Poses)]:
         made = [*approach_together(scene, poses)]

@@ -215,8 +215,6 @@ class SceneSpec(Section):
         self._check_names()
         if self.names and self.plan is not None:
             raise ValueError("plan: a tolerance is for one tool; leave [plan] out")
-        if self.names and self.output.play:
-            raise ValueError("output.play: the page shows one tool; set play = false")
         return self
 
     @property

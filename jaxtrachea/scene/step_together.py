@@ -11,6 +11,7 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.scene.anchor import Instant
+from jaxtrachea.scene.approach import on_its_own
 from jaxtrachea.scene.grip import pick
 from jaxtrachea.scene.hold import hold
 from jaxtrachea.scene.instruments import scene_of, touch_together
@@ -83,6 +84,10 @@ def _hold(view: Scene, material: AnyMaterial, state: Any, path: Poses, seen, pre
     at = jax.tree.map(lambda v: v[0], whereabouts(view, *here))
     side = next_side(state.side, at)
     inside = (side == Side.IN_LUMEN)[None]
+    if view.plan.contact_point == "per_step":
+        after = eqx.tree_at(lambda v: v.side, state, side)
+        made = on_its_own(view, path, off)._replace(own=seen, inside=inside)
+        return _Held(after, made, (off.gap[0] < 0) & ~inside[0], at.known)
     after, _, made, held = hold(view, long_run(material), state, here, inside)
     after = eqx.tree_at(lambda v: v.side, after, side)
     return _Held(after, made._replace(own=seen), held.touching, at.known)

@@ -43,9 +43,31 @@ function make(kind, parent, style = {}, text = "") {
   return e;
 }
 
+function makeTool(T, world, { arrays, colours }, k) { // its picture, its force, and what it is printed with
+  const corners = arrays[`tool${k}`], sides = arrays[`sides${k}`], shape = new T.BufferGeometry();
+  shape.setAttribute("position", new T.BufferAttribute(corners, 3));
+  shape.setIndex(new T.BufferAttribute(sides, 1)); shape.computeVertexNormals();
+  const mesh = new T.Mesh(shape, new T.MeshStandardMaterial({ color: colours[k % colours.length], transparent: true,
+    opacity: 0.45, depthWrite: false }));
+  mesh.visible = corners.length > 0;
+  const arrow = new T.ArrowHelper(new T.Vector3(0, 1, 0), new T.Vector3(), 10, "#c0102a", 3, 2);
+  arrow.visible = false;
+  world.add(mesh, arrow);
+  // Faces as half-spaces: a vertex of the wall at rest within all of them is printed on.
+  const spaces = [], p = (i) => new T.Vector3().fromArray(corners, 3 * i);
+  for (let f = 0; f < sides.length; f += 3) {
+    const a = p(sides[f]), w = p(sides[f + 1]).sub(a).cross(p(sides[f + 2]).sub(a));
+    if (w.length() > 1e-12) { w.normalize(); spaces.push(w.x, w.y, w.z, w.dot(a)); }
+  }
+  let widest = 0;
+  for (let i = 0; i < corners.length; i += 3)
+    widest = Math.max(widest, Math.hypot(corners[i], corners[i + 1], corners[i + 2]));
+  return { mesh, arrow, corners, spaces, widest };
+}
+
 export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true } = {}) {
-  const { rest, faces, ring, joints, tool: corners, sides } = scene.arrays, n = rest.length / 3;
-  const option = { colour: "displacement", map: "viridis", plane: "free", rings: true, joints: true,
+  const { rest, faces, ring, joints } = scene.arrays, n = rest.length / 3, several = scene.tools.length > 1;
+  const option = { tool: 0, colour: "displacement", map: "viridis", plane: "free", rings: true, joints: true,
     print: true, rest: true, hold: false };
   el.style.position = "relative"; el.style.overflow = "hidden"; el.tabIndex = 0; el.style.outline = "none";
 
@@ -75,18 +97,12 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   ghostShape.setAttribute("position", new T.BufferAttribute(rest, 3)); ghostShape.setIndex(wall.index);
   const ghost = new T.Mesh(ghostShape, new T.MeshBasicMaterial({ color: "#7788aa", wireframe: true,
     transparent: true, opacity: 0.08, depthWrite: false }));
-  const toolShape = new T.BufferGeometry();
-  toolShape.setAttribute("position", new T.BufferAttribute(corners, 3));
-  toolShape.setIndex(new T.BufferAttribute(sides, 1)); toolShape.computeVertexNormals();
-  const tool = new T.Mesh(toolShape, new T.MeshStandardMaterial({ color: "#d0703a", transparent: true,
-    opacity: 0.45, depthWrite: false }));
   const dots = new T.InstancedMesh(new T.SphereGeometry(0.9, 10, 8),
     new T.MeshStandardMaterial({ color: "#1d3557" }), joints.length);
   dots.frustumCulled = false;
-  const arrow = new T.ArrowHelper(new T.Vector3(0, 1, 0), new T.Vector3(), 10, "#c0102a", 3, 2);
-  arrow.visible = false;
-  world.add(mesh, ghost, tool, dots, arrow);
-  tool.visible = corners.length > 0;
+  world.add(mesh, ghost, dots);
+  const tools = scene.tools.map((_, k) => makeTool(T, world, scene, k));
+  let tool = tools[0].mesh, corners = tools[0].corners; // those in hand
   const orbit = new Orbit(camera, renderer.domElement);
   let dirty = true;
   orbit.addEventListener("change", () => { dirty = true; });
@@ -98,6 +114,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   number.dataset.role = "force";
   const second = make("div", head, {}, ""); second.dataset.role = "detail";
   const third = make("div", head, { fontSize: "12px" }, ""); third.dataset.role = "place";
+  const others = make("div", head, { whiteSpace: "pre" }); others.dataset.role = "others";
   const legend = make("div", el, { ...over, left: "8px", bottom: "8px", width: "220px", boxSizing: "content-box", padding: "6px",
     background: "rgba(255,255,255,.8)", borderRadius: "4px", fontSize: "12px" });
   const bar = make("canvas", legend, { width: "220px", height: "12px", display: "block" });
@@ -108,28 +125,29 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   const names = [["carina", -1], ["larynx", 1]].map(([text, side]) =>
     [make("div", el, { ...over, fontSize: "12px",
       background: "rgba(255,255,255,.8)", padding: "1px 4px", borderRadius: "3px" }, text), side]);
-  const tools = make("div", el, { position: "absolute", right: "8px", top: "8px", display: "flex",
+  const panel = make("div", el, { position: "absolute", right: "8px", top: "8px", display: "flex",
     flexDirection: "column", gap: "3px", font: "12px sans-serif", background: "rgba(255,255,255,.8)",
     padding: "6px", borderRadius: "4px" });
 
   function choice(label, key, values) {
-    const row = make("label", tools, { display: "flex", gap: "6px", justifyContent: "space-between" }, label);
+    const row = make("label", panel, { display: "flex", gap: "6px", justifyContent: "space-between" }, label);
     const box = make("select", row); box.dataset.option = key;
     for (const [value, text] of Object.entries(values)) make("option", box, {}, text).value = value;
     box.onchange = () => set(key, box.value);
   }
   function tick(label, key) {
-    const row = make("label", tools, { display: "flex", gap: "6px" });
+    const row = make("label", panel, { display: "flex", gap: "6px" });
     const box = make("input", row); box.type = "checkbox"; box.checked = option[key]; box.dataset.option = key;
     row.append(label);
     box.onchange = () => set(key, box.checked);
   }
   choice("colour", "colour", COLOURS);
   choice("scale", "map", { viridis: "viridis", cividis: "cividis" });
+  if (several) choice("tool", "tool", { ...scene.tools });
   if (movable) { choice("drag", "plane", PLANES); tick("hold the tool", "hold"); }
   for (const [label, key] of [["rings", "rings"], ["ring midpoints", "joints"], ["print of the tool", "print"],
     ["rest shape", "rest"]]) tick(label, key);
-  const buttons = make("div", tools, { display: "flex", gap: "4px" });
+  const buttons = make("div", panel, { display: "flex", gap: "4px" });
   const button = (text, act) => { make("button", buttons, {}, text).onclick = act; };
   button("PNG", png); button("film", film);
 
@@ -139,9 +157,17 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
 
   function set(key, value) {
     option[key] = value;
+    if (key === "tool") take(+value);
     if (key === "map") colours = colourMap(value);
     dots.visible = option.joints; ghost.visible = option.rest;
     paint();
+  }
+
+  function take(k) { // into the hand
+    option.tool = k; tool = tools[k].mesh; corners = tools[k].corners;
+    const box = panel.querySelector("[data-option=tool]");
+    if (box) box.value = k;
+    tell(); dirty = true;
   }
 
   function paint() {
@@ -154,7 +180,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
       if (values[i] > top) top = values[i];
     }
     const stale = last !== null && !last.solved;
-    const inside = option.print && tool.visible ? printed() : null;
+    const inside = option.print ? printed() : null;
     for (let i = 0; i < n; i++) {
       const k = 3 * Math.round(255 * Math.min(values[i] / top, 1));
       const light = option.rings && ring[i] ? 0.12 : 0, dim = inside && inside[i] ? 0.3 : 1;
@@ -176,72 +202,76 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     dirty = true;
   }
 
-  // Faces of the tool as half-spaces: a vertex of the wall at rest within all of them is printed on.
-  const spaces = [];
-  {
-    const p = (i) => new T.Vector3().fromArray(corners, 3 * i);
-    for (let f = 0; f < sides.length; f += 3) {
-      const a = p(sides[f]), w = p(sides[f + 1]).sub(a).cross(p(sides[f + 2]).sub(a));
-      if (w.length() > 1e-12) { w.normalize(); spaces.push(w.x, w.y, w.z, w.dot(a)); }
-    }
-  }
-  let widest = 0;
-  for (let i = 0; i < corners.length; i += 3)
-    widest = Math.max(widest, Math.hypot(corners[i], corners[i + 1], corners[i + 2]));
   function printed() {
-    const out = new Uint8Array(n), p = tool.position, back = new T.Matrix4().copy(tool.matrixWorld).invert();
-    const x = new T.Vector3();
-    for (let i = 0; i < n; i++) {
-      if (Math.hypot(rest[3 * i] - p.x, rest[3 * i + 1] - p.y, rest[3 * i + 2] - p.z) > widest) continue;
-      x.fromArray(rest, 3 * i).applyMatrix4(back);
-      let k = 0;
-      while (k < spaces.length && spaces[k] * x.x + spaces[k + 1] * x.y + spaces[k + 2] * x.z <= spaces[k + 3]) k += 4;
-      out[i] = k >= spaces.length ? 1 : 0;
+    const out = new Uint8Array(n), x = new T.Vector3();
+    for (const { mesh: { visible, position: p, matrixWorld }, spaces, widest } of tools) {
+      if (!visible) continue;
+      const back = new T.Matrix4().copy(matrixWorld).invert();
+      for (let i = 0; i < n; i++) {
+        if (Math.hypot(rest[3 * i] - p.x, rest[3 * i + 1] - p.y, rest[3 * i + 2] - p.z) > widest) continue;
+        x.fromArray(rest, 3 * i).applyMatrix4(back);
+        let k = 0;
+        while (k < spaces.length && spaces[k] * x.x + spaces[k + 1] * x.y + spaces[k + 2] * x.z <= spaces[k + 3]) k += 4;
+        out[i] |= k >= spaces.length ? 1 : 0;
+      }
     }
     return out;
   }
 
-  function posed(pose) { // rotation by rows, translation
-    const r = new T.Matrix4().set(pose[0], pose[1], pose[2], 0, pose[3], pose[4], pose[5], 0,
-      pose[6], pose[7], pose[8], 0, 0, 0, 0, 1);
-    tool.quaternion.setFromRotationMatrix(r); tool.position.set(pose[9], pose[10], pose[11]);
-    tool.updateMatrixWorld(true); dirty = true;
+  function posed(all) { // of each tool the rotation by rows, then the translation
+    tools.forEach(({ mesh }, k) => {
+      const q = all.slice(12 * k, 12 * k + 12);
+      const r = new T.Matrix4().set(q[0], q[1], q[2], 0, q[3], q[4], q[5], 0, q[6], q[7], q[8], 0, 0, 0, 0, 1);
+      mesh.quaternion.setFromRotationMatrix(r); mesh.position.set(q[9], q[10], q[11]);
+      mesh.updateMatrixWorld(true);
+    });
+    dirty = true;
   }
   function pose() {
     const q = tool.quaternion.clone().normalize(), e = new T.Matrix4().makeRotationFromQuaternion(q).elements;
     return [e[0], e[4], e[8], e[1], e[5], e[9], e[2], e[6], e[10], ...tool.position.toArray()];
   }
 
-  // A frame: ten numbers (status, vertices, force, depth, point, ms) and positions.
+  // A frame: vertices, ms, of each tool eight numbers (status, force, depth, point); positions.
   function show(h, positions) {
-    const [name, message, forced] = scene.statuses[h[0]], solved = positions !== null;
+    const solved = positions !== null;
     if (solved) { surface.array.set(positions); surface.needsUpdate = true; }
-    const f = Math.hypot(h[2], h[3], h[4]), has = solved && forced;
-    last = { status: name, solved, force: has ? f : null, depth: solved ? h[5] : null };
-    number.textContent = has ? `F ${f.toFixed(4)} N` : name === "NO_CONTACT" ? "no contact" : "no force";
-    second.textContent = !solved || (has && name !== "OK") ? message
-      : has ? `depth ${h[5].toFixed(3)} mm` : "the tool does not touch";
-    if (!solved) second.textContent += " (grey: the last surface)";
-    third.textContent = tool.visible ? `tool at ${tool.position.toArray().map((v) => v.toFixed(2)).join(", ")} mm` : "";
-    arrow.visible = has && f > 1e-6;
-    if (arrow.visible) {
-      const way = new T.Vector3(h[2], h[3], h[4]).normalize(), long = 8 + 20 * Math.min(f, 2);
-      arrow.setDirection(way); arrow.setLength(long, 3, 2);
-      arrow.position.set(h[6], h[7], h[8]).addScaledVector(way, -long);
-    }
+    const touches = tools.map(({ arrow }, k) => {
+      const [status, x, y, z, depth, ...point] = h.subarray(2 + 8 * k, 10 + 8 * k);
+      const [name, message, forced] = scene.statuses[status], f = Math.hypot(x, y, z), has = solved && forced;
+      arrow.visible = has && f > 1e-6;
+      if (arrow.visible) {
+        const way = new T.Vector3(x, y, z).normalize(), long = 8 + 20 * Math.min(f, 2);
+        arrow.setDirection(way); arrow.setLength(long, 3, 2);
+        arrow.position.fromArray(point).addScaledVector(way, -long);
+      }
+      const words = !solved || (has && name !== "OK") ? message
+        : has ? `depth ${depth.toFixed(3)} mm` : "the tool does not touch";
+      return { status: name, solved, force: has ? f : null, depth: solved ? depth : null, words,
+        label: has ? `F ${f.toFixed(4)} N` : name === "NO_CONTACT" ? "no contact" : "no force" };
+    });
+    last = { ...touches[option.tool], solved, touches };
     stats.frames++;
-    paint();
+    tell(); paint();
     return last;
+  }
+  function tell() { // the words over the picture: of the tool in hand, then of the others
+    if (last === null) return;
+    const own = last.touches[option.tool];
+    number.textContent = own.label; second.textContent = own.words + (last.solved ? "" : " (grey: the last surface)");
+    const named = several ? scene.tools[option.tool] : "tool";
+    third.textContent = tool.visible ? `${named} at ${tool.position.toArray().map((v) => v.toFixed(2)).join(", ")} mm` : named;
+    others.textContent = last.touches.map((t, k) => `${scene.tools[k]}: ${t.label}`).filter((_, k) => k !== option.tool).join("\n");
   }
   function frame(buffer) {
     stats.bytes = buffer.byteLength;
-    const h = new Float32Array(buffer, 0, 10);
-    return show(h, h[1] > 0 ? new Float32Array(buffer, 40) : null);
+    const size = 2 + 8 * tools.length, h = new Float32Array(buffer, 0, size);
+    return show(h, h[0] > 0 ? new Float32Array(buffer, 4 * size) : null);
   }
 
   // The hand.
   function moved() {
-    tool.position.clampScalar(-FAR, FAR); tool.updateMatrixWorld(true); dirty = true; onPose(pose());
+    tool.position.clampScalar(-FAR, FAR); tool.updateMatrixWorld(true); dirty = true; onPose(option.tool, pose());
   }
   const ray = new T.Raycaster(), plane = new T.Plane(), hit = new T.Vector3(), grip = new T.Vector3();
   let dragging = false, down = null;
@@ -253,8 +283,9 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   const ways = { x: new T.Vector3(1, 0, 0), y: new T.Vector3(0, 1, 0), z: new T.Vector3(0, 0, 1) };
   renderer.domElement.addEventListener("pointerdown", (e) => {
     el.focus(); aim(e); down = [e.clientX, e.clientY];
-    const on = movable && !option.hold && ray.intersectObject(tool)[0];
+    const on = movable && !option.hold && ray.intersectObjects(tools.map((t) => t.mesh))[0];
     if (!on) return;
+    take(tools.findIndex((t) => t.mesh === on.object));
     dragging = true; orbit.enabled = false; renderer.domElement.setPointerCapture(e.pointerId);
     plane.setFromNormalAndCoplanarPoint(ways[option.plane] ?? camera.getWorldDirection(new T.Vector3()), on.point);
     grip.copy(tool.position).sub(on.point);
@@ -294,7 +325,8 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
   function key(e) {
     if (!movable || option.hold || e.ctrlKey || e.metaKey || e.altKey) return;
     if (e.target.matches?.("input, select, textarea")) return;
-    const less = e.shiftKey ? 0.1 : 1;
+    const less = e.shiftKey ? 0.1 : 1, digit = /^Digit([1-9])$/.exec(e.code);
+    if (several && digit && tools[digit[1] - 1]) { take(digit[1] - 1); return; }
     if (shifts[e.code]) {
       const [axis, sign] = shifts[e.code];
       tool.position.setComponent(axis, tool.position.getComponent(axis) + sign * less * STEP);
@@ -315,6 +347,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     c.font = "600 24px sans-serif"; c.fillText(number.textContent, 12, 32);
     c.font = "14px sans-serif"; c.fillText(second.textContent, 12, 54);
     c.font = "12px sans-serif"; c.fillText(third.textContent, 12, 72);
+    c.font = "14px sans-serif"; others.textContent.split("\n").forEach((t, k) => c.fillText(t, 12, 92 + 18 * k));
     const h = gl.clientHeight;
     c.drawImage(bar, 12, h - 40, 180, 12);
     c.font = "12px sans-serif"; c.fillText(`0 to ${high.textContent}: ${what.textContent}`, 12, h - 12);
@@ -362,8 +395,8 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     const q = p.clone().project(camera), b = renderer.domElement.getBoundingClientRect();
     return [b.left + ((q.x + 1) / 2) * b.width, b.top + ((1 - q.y) / 2) * b.height];
   }
-  posed(scene.pose); look(); paint(); draw();
+  posed(scene.poses.flat()); look(); paint(); draw();
   function finite() { return surface.array.every(Number.isFinite); }
   return { frame, show, posed, finite, positions: () => surface.array, deviation: scene.step, pose, look, screen, set, stats, png, get last() { return last; },
-    place(x, y, z) { tool.position.set(x, y, z); moved(); }, send() { onPose(pose()); } };
+    place(x, y, z) { tool.position.set(x, y, z); moved(); }, take, send() { onPose(option.tool, pose()); } };
 }

@@ -1,8 +1,8 @@
 """Bytes between the model and the page: one packet for the scene, one frame for every step.
 
 Packet: length of a JSON text (uint32), the text, then the arrays that its `arrays` names, each from
-a multiple of four bytes on. Frame: ten float32 (`Head`), then the positions of all vertices
-(float32, mm); no positions where the step has no solution. No number of either is NaN.
+a multiple of four bytes on. Frame: its head (float32, `Frame.head`), then the positions of all
+vertices (float32, mm); no positions where the step has no solution. No number of either is NaN.
 """
 
 import json
@@ -13,24 +13,23 @@ from jaxtyping import Float
 
 from jaxtrachea.status import PressStatus
 
+#: Of tools, one after the other.
+COLOURS = ["#d0703a", "#3a7ca5", "#8a5a9e", "#6b7f3a"]
 #: Largest coordinate of a tool that is taken from a page, mm.
 FARTHEST = 1e4
 #: Longest message that a page may send, bytes.
 LONGEST = 4096
 
 
-class Frame(NamedTuple):
-    """What one step shows.
+class Touch(NamedTuple):
+    """One tool in a step.
 
     Attributes:
-        status: of the step.
+        status: of its contact.
         pose: rotation by rows, then the translation, mm; shape (12,).
         force: on the tube in the frame of the mesh, N; shape (3,). Zeros: no solution.
         depth: of the tool below the wall at rest, mm, not negative.
         point: of the contact on the tool, mm; shape (3,).
-        seconds: that the step took.
-        vertices: of the wall, mm, float32; shape (vertices, 3). None: no solution.
-        time: since the scene was ready, s.
     """
 
     status: PressStatus
@@ -38,14 +37,26 @@ class Frame(NamedTuple):
     force: Float[np.ndarray, "3"]
     depth: float
     point: Float[np.ndarray, "3"]
+
+
+class Frame(NamedTuple):
+    """What one step shows.
+
+    Attributes:
+        touches: of every tool, in the order of the scene.
+        seconds: that the step took.
+        vertices: of the wall, mm, float32; shape (vertices, 3). None: no solution.
+        time: since the scene was ready, s.
+    """
+
+    touches: tuple[Touch, ...]
     seconds: float
     vertices: np.ndarray | None
     time: float = 0.0
 
-    @property
-    def has_force(self) -> bool:
-        """Whether there is a force to show: the step is solved, and the tool touches."""
-        return self.vertices is not None and self.status != PressStatus.NO_CONTACT
+    def has_force(self, tool: int) -> bool:
+        """Whether there is a force of this tool: the step is solved, and the tool touches."""
+        return self.vertices is not None and has_force(self.touches[tool].status)
 
     @property
     def light(self) -> "Frame":
@@ -59,10 +70,16 @@ class Frame(NamedTuple):
 
     @property
     def head(self) -> np.ndarray:
-        """Status, vertices, force (3), depth, point (3), milliseconds; float32."""
-        count = 0 if self.vertices is None else len(self.vertices)
-        values = [self.status, count, *self.force, self.depth, *self.point, 1e3 * self.seconds]
+        """Vertices, milliseconds; of every tool status, force (3), depth, point (3); float32."""
+        values = [0 if self.vertices is None else len(self.vertices), 1e3 * self.seconds]
+        for touch in self.touches:
+            values += [touch.status, *touch.force, touch.depth, *touch.point]
         return np.array(values, np.float32)
+
+
+def has_force(status: PressStatus) -> bool:
+    """Whether a solved step with this status has a force to show."""
+    return status.solved and status != PressStatus.NO_CONTACT
 
 
 def packet(text: dict, arrays: dict[str, np.ndarray]) -> bytes:
@@ -80,25 +97,30 @@ def packet(text: dict, arrays: dict[str, np.ndarray]) -> bytes:
 
 def statuses() -> dict[int, list]:
     """Of each status its name, its sentence, and whether there is a force."""
-    return {
-        int(s): [s.name, s.message, s.solved and s != PressStatus.NO_CONTACT] for s in PressStatus
-    }
+    return {int(s): [s.name, s.message, has_force(s)] for s in PressStatus}
 
 
-def read_pose(text: str) -> np.ndarray | None:
-    """A pose that a page sends, `{"pose": [12 numbers]}`; None: it acknowledges a frame.
+def read_pose(text: str, tools: int) -> tuple[int, np.ndarray] | None:
+    """A tool and its pose, `{"tool": 0, "pose": [12 numbers]}`; None: a frame is acknowledged.
+
+    Args:
+        text: that a page sends.
+        tools: how many the scene has.
 
     Raises:
-        ValueError: any other text, numbers that are too large or not finite, or no rotation.
+        ValueError: any other text, no such tool, numbers that are too large or not finite, or no
+            rotation.
     """
     if len(text) > LONGEST:
         raise ValueError("too long")
     message = json.loads(text)
     if message == "drawn":
         return None
-    if not isinstance(message, dict) or set(message) != {"pose"}:
+    if not isinstance(message, dict) or set(message) != {"tool", "pose"}:
         raise ValueError("neither a pose nor an acknowledgement")
-    numbers = message["pose"]
+    tool, numbers = message["tool"], message["pose"]
+    if type(tool) is not int or not 0 <= tool < tools:
+        raise ValueError("no such tool")
     kinds = isinstance(numbers, list) and all(type(v) in (int, float) for v in numbers)
     if not kinds or len(numbers) != 12:
         raise ValueError("expected 12 numbers")
@@ -108,4 +130,4 @@ def read_pose(text: str) -> np.ndarray | None:
     turn = pose[:9].reshape(3, 3)
     if abs(turn @ turn.T - np.eye(3)).max() > 1e-9 or np.linalg.det(turn) < 0:
         raise ValueError("no rotation")
-    return pose
+    return tool, pose

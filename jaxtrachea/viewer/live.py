@@ -25,8 +25,9 @@ REST, SEEN = 0.05, (1e-5, 1e-3)
 class Live(Worker):
     """A scene under a hand.
 
-    The thread reads and compiles, then answers poses and values one after the other. A pose that
-    another one follows before its turn is left out, so the picture never lags behind the hand.
+    The thread reads and compiles, then answers poses and values one after the other. A pose of a
+    tool that another one follows before its turn is left out, so the picture never lags behind the
+    hand.
 
     Attributes:
         path: of the scene file.
@@ -54,37 +55,34 @@ class Live(Worker):
         self.steps: list[Frame] = []
         self.recording: list[Frame] | None = None
         self._values: dict[str, float] = {}
-        self._pose: np.ndarray | None = None
-        self._last: np.ndarray | None = None
+        self._poses = np.zeros((0, 12))
+        self._fresh = self._reset = False
         self._began = self._before = 0.0
-        self._reset = False
 
-    def move(self, pose: np.ndarray) -> None:
-        """Move the tool: rotation by rows, then translation, mm; shape (12,)."""
+    def move(self, pose: np.ndarray, tool: int = 0) -> None:
+        """Move a tool: rotation by rows, then translation, mm; shape (12,)."""
         with self._wake:
-            self._pose = pose
+            self._poses[tool], self._fresh = pose, True
             self._wake.notify()
 
     def set_value(self, name: str, value: float) -> None:
         """Go on with another value of a parameter, in its unit; nothing is compiled."""
         with self._wake:
-            self._values[name] = value
-            self._pose = self._last if self._pose is None else self._pose
+            self._values[name], self._fresh = value, True
             self._wake.notify()
 
     def reset(self) -> None:
-        """Forget where the tool was, put it to the start, and take the values of the file."""
+        """Forget where the tools were, put them to the start, and take the values of the file."""
         with self._wake:
-            self._reset = True
+            self._reset = self._fresh = True
             self._values = {s.name: s.value for s in self.sliders}
-            self._pose = self.start_pose
+            self._poses = self.handled.poses.copy()
             self._wake.notify()
 
     @property
-    def start_pose(self) -> np.ndarray:
-        """Of the tool at the start; shape (12,)."""
-        assert self.handled is not None
-        return np.concatenate([self.handled.rotation.ravel(), self.handled.translation])
+    def tools(self) -> int:
+        """How many there are, once the scene is read."""
+        return len(self._poses)
 
     @property
     def values(self) -> dict[str, float]:
@@ -94,38 +92,39 @@ class Live(Worker):
     def prepare(self) -> Any:
         """The session."""
         self.set_up()
-        from jaxtrachea.viewer.protocol import scene_packet
+        from jaxtrachea.viewer.protocol import tools_packet, tube_arrays, tube_of
         from jaxtrachea.viewer.scene import read_handled
         from jaxtrachea.viewer.values import sliders
 
         handled = read_handled(self.path, lambda text: self.tell("reading", text))
         self.handled = handled
-        scene = handled.staged.scene
-        self.packet = scene_packet(scene, handled.title, self.start_pose)
+        scene, self._poses = handled.staged.scene, handled.poses.copy()
+        self.packet = tools_packet(
+            handled.title, handled.names, handled.tools, handled.poses, tube_arrays(*tube_of(scene))
+        )
         self.tell("compiling", "compiling the scene")
         session = handled.session()
         self.sliders = sliders(_long_run(session.material), scene.plan)
         # The first step also loads what runs at the first step only.
-        self.frame = self._step(session, self.start_pose)
+        self.frame = self._step(session, handled.poses)
         session.reset()
-        self._pose, self._began = self.start_pose, time.monotonic()
+        self._fresh, self._began = True, time.monotonic()
         return session
 
     def answer(self, session: Any) -> bool:
         """One step; whether to go on."""
-        rest = REST if session.scene.plan.has("relaxation") and self._last is not None else None
+        rest = REST if session.scene.plan.has("relaxation") else None
         with self._wake:
-            moved = self._wake.wait_for(lambda: self._pose is not None or self._ended, rest)
+            moved = self._wake.wait_for(lambda: self._fresh or self._ended, rest)
             if self._ended:
                 return False
-            pose, self._pose = self._last if self._pose is None else self._pose, None
-            assert pose is not None
-            values, reset, self._reset = dict(self._values), self._reset, False
+            poses, values, reset = self._poses.copy(), dict(self._values), self._reset
+            self._fresh = self._reset = False
         try:
             if reset:
                 session.reset()
             self._set(session, values)
-            frame = self._step(session, pose)
+            frame = self._step(session, poses)
         except Exception as error:  # the page says it; the next pose may do
             traceback.print_exc()
             self.fault = f"{type(error).__name__}: {error}"
@@ -133,7 +132,7 @@ class Live(Worker):
             return True
         if not moved and self.frame is not None and _alike(frame, self.frame):
             return True
-        self.frame, self.fault, self._last = frame, "", pose
+        self.frame, self.fault = frame, ""
         self.steps.append(frame.light)
         del self.steps[:-MOST_STEPS]
         self._record(frame)
@@ -156,13 +155,17 @@ class Live(Worker):
                 changed = dataclasses.replace(whole, material=changed)
             session.set_material(changed)
 
-    def _step(self, session: Any, pose: np.ndarray) -> Frame:
+    def _step(self, session: Any, poses: np.ndarray) -> Frame:
         from jaxtrachea.viewer.protocol import frame_of
 
         begin = time.monotonic()
         dt, self._before = begin - (self._before or begin), begin
-        result = session.step(pose[:9].reshape(3, 3), pose[9:], np.float64(dt))
-        frame = frame_of(session.scene.tool, pose, result, time.monotonic() - begin)
+        turned = [(pose[:9].reshape(3, 3), pose[9:]) for pose in poses]
+        if names := session.scene.names:
+            result = session.step(dict(zip(names, turned, strict=True)), dt=np.float64(dt))
+        else:
+            result = session.step(*turned[0], np.float64(dt))
+        frame = frame_of(self.handled.tools, poses, result, time.monotonic() - begin)
         return frame._replace(time=begin - self._began)
 
     def _record(self, frame: Frame) -> None:
@@ -182,7 +185,8 @@ def _long_run(material: Any) -> Any:
 
 def _alike(a: Frame, b: Frame) -> bool:
     """Whether nobody sees a difference."""
-    if a.status != b.status or a.vertices is None or b.vertices is None:
-        return a.status == b.status
-    force, place = abs(a.force - b.force).max(), abs(a.vertices - b.vertices).max()
-    return bool(force < SEEN[0] and place < SEEN[1])
+    told = [[t.status for t in f.touches] for f in (a, b)]
+    if told[0] != told[1] or a.vertices is None or b.vertices is None:
+        return told[0] == told[1]
+    force = max(abs(x.force - y.force).max() for x, y in zip(a.touches, b.touches, strict=True))
+    return bool(force < SEEN[0] and abs(a.vertices - b.vertices).max() < SEEN[1])

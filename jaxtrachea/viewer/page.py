@@ -10,6 +10,7 @@ from nicegui import app, ui
 from nicegui.element import Element
 from nicegui.elements.scene.scene import Scene as _Scene  # registers the module that holds three.js
 
+from jaxtrachea.viewer.frame import COLOURS
 from jaxtrachea.viewer.live import Live
 from jaxtrachea.viewer.serve import SMALL, Page, serve
 from jaxtrachea.viewer.server import Frames, add_routes
@@ -21,6 +22,7 @@ KEYS = (
     "drag the tool, or click the wall to press there. Arrows: along x and y; page up and down: z; "
     "shift: a tenth. Q E, A D, W S turn the tool about x, y, z."
 )
+MORE_KEYS = " 1 to 9: the tool in hand; so does a drag of it."
 
 
 class Wall(Element, component="wall.js"):
@@ -61,16 +63,20 @@ class ScenePage(Page):
         )
         self.wall.on("lost", lambda e: self.lost(e.args))
         with ui.column().style("width:376px;gap:6px"):
-            ui.label(KEYS).style("font-size:12px;color:#555")
+            several = MORE_KEYS if self.live.tools > 1 else ""
+            ui.label(KEYS + several).style("font-size:12px;color:#555")
             for note in self.live.handled.notes if self.live.handled else ():
                 ui.label(note).style("font-size:12px;color:#555")
             self.position()
             self.chart = ui.echart(
-                {"animation": False, "grid": {"left": 56, "right": 16, "top": 28, "bottom": 40},
+                {"animation": False, "color": COLOURS,
+                 "grid": {"left": 56, "right": 16, "top": 28, "bottom": 40},
                  "xAxis": {"type": "value", "name": "depth of the tool below the rest wall [mm]",
                            "nameLocation": "middle", "nameGap": 24},
                  "yAxis": {"type": "value", "name": "|F| [N]"},
-                 "series": [{"type": "line", "showSymbol": False, "data": []}]}
+                 "legend": {"show": self.live.tools > 1, "top": 0},
+                 "series": [{"type": "line", "showSymbol": False, "data": [], "name": name}
+                            for name in self.live.handled.names]}
             ).style("height:210px;width:370px")  # fmt: skip
             with ui.row().style("gap:6px"):
                 ui.button("clear", on_click=self.clear).props(SMALL)
@@ -83,7 +89,7 @@ class ScenePage(Page):
 
     def position(self) -> None:
         """Three numbers to type, and the way back to the start."""
-        start = self.live.start_pose[9:]
+        start = self.live.handled.poses[0, 9:]
         with ui.row().style("gap:6px;align-items:center;flex-wrap:nowrap"):
             boxes = [
                 ui.number(f"{axis} [mm]", value=float(v), format="%.3f", min=-1e3, max=1e3)
@@ -124,7 +130,7 @@ class ScenePage(Page):
         for widget, s in zip(self.widgets, self.live.sliders, strict=True):
             widget.set_value(s.share)
         self.live.reset()
-        self.wall.run_method("posed", self.live.start_pose.tolist())
+        self.wall.run_method("posed", self.live.handled.poses.ravel().tolist())
 
     def clear(self) -> None:
         """Begin the curve anew."""
@@ -137,22 +143,23 @@ class ScenePage(Page):
         if self.live.frame is self.shown:
             return
         self.shown = self.live.frame
-        data = [[f.depth, float((f.force**2).sum() ** 0.5)] for f in self.live.steps[-300:]
-                if f.has_force]  # fmt: skip
-        self.chart.options["series"][0]["data"] = data
+        for k, series in enumerate(self.chart.options["series"]):
+            touches = [f.touches[k] for f in self.live.steps[-300:] if f.has_force(k)]
+            series["data"] = [[t.depth, float((t.force**2).sum() ** 0.5)] for t in touches]
         self.chart.update()
 
     def save_curve(self) -> None:
         """The steps as CSV."""
         text = io.StringIO()
         rows = csv.writer(text)
-        rows.writerow(["time_s", "x_mm", "y_mm", "z_mm", "depth_mm",
+        rows.writerow(["time_s", "tool", "x_mm", "y_mm", "z_mm", "depth_mm",
                        "force_x_N", "force_y_N", "force_z_N", "status"])  # fmt: skip
         for f in self.live.steps:
-            numbers = [f.time, *f.pose[9:], f.depth, *f.force]
-            # No force is an empty cell, never a zero.
-            cells = [f"{v:.9g}" for v in (numbers if f.has_force else numbers[:4])]
-            rows.writerow([*cells, *[""] * (8 - len(cells)), f.status.name])
+            for k, (name, t) in enumerate(zip(self.live.handled.names, f.touches, strict=True)):
+                # No force is an empty cell, never a zero.
+                numbers = [*t.pose[9:], t.depth, *t.force] if f.has_force(k) else t.pose[9:]
+                cells = [f"{v:.9g}" for v in numbers] + [""] * (7 - len(numbers))
+                rows.writerow([f"{f.time:.9g}", name, *cells, t.status.name])
         ui.download.content(text.getvalue(), "curve.csv", "text/csv")
 
     def save_values(self) -> None:
@@ -180,7 +187,7 @@ class ScenePage(Page):
             return
         from jaxtrachea.viewer.play import of_frames
 
-        page = of_frames(live.handled.staged.scene, live.handled.title, frames)
+        page = of_frames(live.handled, frames)
         ui.download.content(page, "play.html", "text/html")
 
     def lost(self, code: object) -> None:

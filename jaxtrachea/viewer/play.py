@@ -9,15 +9,18 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.scene.read import SimulationFileError, read_simulation
-from jaxtrachea.scene.solids import nearest_vertices, rings_on
-from jaxtrachea.scene.stage import Scene
-from jaxtrachea.viewer.frame import Frame, packet, statuses
-from jaxtrachea.viewer.protocol import frame_of, tube_arrays, tube_of
+from jaxtrachea.scene.recording import MovingTool, NoSurface, recording_of
+from jaxtrachea.scene.solids import rings_on
+from jaxtrachea.viewer.frame import Frame
+from jaxtrachea.viewer.protocol import frame_of, tools_packet, tube_arrays, tube_of
+from jaxtrachea.viewer.scene import Handled
 
 HERE = Path(__file__).parent
 #: Bytes of displacements in a page at most; of a longer recording some rows are left out, evenly.
@@ -32,20 +35,18 @@ class PlayError(InputError):
     """A recording that cannot be played, and why."""
 
 
-def of_frames(scene: Scene, title: str, frames: Sequence[Frame]) -> str:
+def of_frames(handled: Handled, frames: Sequence[Frame]) -> str:
     """The page of frames that were recorded.
 
     Args:
-        scene: that they are of.
-        title: of the page.
+        handled: the scene that they are of.
         frames: in order; those without vertices are shown by their status.
 
     Raises:
         PlayError: no frame has vertices, or three.js is not installed.
     """
-    assert scene.tool is not None
-    arrays = tube_arrays(*tube_of(scene), scene.tool)
-    return _page(title, arrays, frames)
+    arrays = tube_arrays(*tube_of(handled.staged.scene))
+    return _page(handled.title, handled.names, handled.tools, arrays, frames)
 
 
 def of_file(path: Path, title: str = "") -> str:
@@ -62,36 +63,39 @@ def of_file(path: Path, title: str = "") -> str:
         stored = read_simulation(path)
     except SimulationFileError as error:
         raise PlayError.like(error) from None
-    series, rest, tool = stored.simulation, stored.rest, stored.tool
-    if isinstance(tool, dict) or isinstance(stored.path, dict):
-        raise PlayError(
-            "has several tools, and the page plays one", place=str(path),
-            cure="simulate with a single [tool]",
-        )  # fmt: skip
-    if rest is None or series.vertices is None:
-        raise PlayError(
-            "has no surface", place=str(path), cure="simulate with surface = true in [output]"
-        )
-    poses = np.zeros((len(series.status), 12))
-    if stored.path is not None:
-        poses[:, :9] = np.asarray(stored.path.rotation).reshape(-1, 9)
-        poses[:, 9:] = stored.path.translation
-    where = rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)
-    arrays = tube_arrays(rest["vertices"], rest["faces"], *where, tool)
-    near = nearest_vertices(series.s, series.phi, rest)
+    try:
+        recorded = recording_of(stored)
+    except NoSurface as error:
+        raise PlayError.like(error, place=str(path)) from None
+    series, rest = stored.simulation, stored.rest
+    assert rest is not None
+    shapes = stored.tool if isinstance(stored.tool, dict) else {"tool": stored.tool}
+    tools = [shapes.get(moving.name) for moving in recorded.tools]
+    poses = np.stack([_poses(moving, series.vertices) for moving in recorded.tools], axis=1)
     frames = []
     for i, pose in enumerate(poses):
         given = {name: getattr(series, name) for name in SHOWN}
         row = {name: None if v is None else v[i] for name, v in given.items()}
-        if tool is None:
-            pose = np.concatenate([np.eye(3).ravel(), series.vertices[i, near[i]]])
-        frames.append(frame_of(tool, np.nan_to_num(pose), SimpleNamespace(**row), 0.0))
-    return _page(title or path.stem, arrays, frames, place=str(path))
+        frames.append(frame_of(tools, pose, SimpleNamespace(**row), 0.0))
+    where = rings_on(rest["s"], rest["phi"], rest["distance"], stored.rings)
+    arrays = tube_arrays(rest["vertices"], rest["faces"], *where)
+    names = [moving.name for moving in recorded.tools]
+    return _page(title or path.stem, names, tools, arrays, frames, place=str(path))
+
+
+def _poses(moving: MovingTool, walls: Any) -> np.ndarray:
+    """Of one tool in every row, see `Touch`; one that cannot be seen is at its contact."""
+    turn, place = moving.rotation, moving.translation
+    if moving.triangles is None:
+        turn = np.broadcast_to(np.eye(3), turn.shape)
+        place = np.asarray(walls)[range(len(turn)), moving.nearest]
+    return np.nan_to_num(np.concatenate([turn.reshape(-1, 9), place], axis=1))
 
 
 def _page(
-    title: str, arrays: dict[str, np.ndarray], frames: Sequence[Frame], place: str = ""
-) -> str:
+    title: str, names: Sequence[str], tools: Sequence[Shape | None], arrays: dict[str, np.ndarray],
+    frames: Sequence[Frame], place: str = "",
+) -> str:  # fmt: skip
     rest = arrays["rest"]
     solved = [f for f in frames if f.vertices is not None]
     if not solved:
@@ -103,12 +107,12 @@ def _page(
     step = float(abs(moves).max()) / TOP or 1.0
     arrays = arrays | {
         "heads": np.stack([f.head for f in kept]),
-        "poses": np.stack([f.pose for f in kept]).astype(np.float32),
+        "poses": np.stack([[t.pose for t in f.touches] for f in kept]).astype(np.float32),
         "moves": np.round(moves / step).astype(np.int16),
     }
-    text = {"title": title, "pose": kept[0].pose.tolist(), "statuses": statuses(), "step": step,
-            "rows": (rows + 1).tolist(), "of": len(frames)}  # fmt: skip
-    return _html(title, packet(text, arrays))
+    first = np.stack([t.pose for t in kept[0].touches])
+    more = {"step": step, "rows": (rows + 1).tolist(), "of": len(frames)}
+    return _html(title, tools_packet(title, names, tools, first, arrays, **more))
 
 
 def _html(title: str, data: bytes) -> str:

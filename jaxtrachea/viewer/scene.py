@@ -1,6 +1,6 @@
-"""A scene for a mouse: the plan of a tool that goes anywhere, and the place where it begins."""
+"""A scene for a mouse: the plan of tools that go anywhere, and the places where they begin."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,21 +23,29 @@ CLEARANCE = 3.0
 
 
 class Handled(NamedTuple):
-    """A scene whose tool a user moves.
+    """A scene whose tools a user moves.
 
     Attributes:
         title: of the scene.
         staged: scene and material; its path is not used.
-        rotation: of the tool at the start; shape (3, 3).
-        translation: of its origin, mm; shape (3,).
+        poses: of the tools at the start: rotation by rows, translation, mm; shape (tools, 12).
         notes: sentences for the user.
     """
 
     title: str
     staged: Staged
-    rotation: np.ndarray
-    translation: np.ndarray
+    poses: np.ndarray
     notes: tuple[str, ...]
+
+    @property
+    def tools(self) -> list[Shape | None]:
+        """About their origins."""
+        return tools_of(self.staged.scene)
+
+    @property
+    def names(self) -> list[str]:
+        """Of the tools; a single one may have none."""
+        return self.staged.scene.names or ["tool"]
 
     def session(self) -> Session:
         """Compile."""
@@ -45,11 +53,12 @@ class Handled(NamedTuple):
 
 
 def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> Handled:
-    """Read a scene file for a tool that goes anywhere.
+    """Read a scene file for tools that go anywhere.
 
-    The second plane is on, and axial motion where `EA_L` is given. The contact point is `per_step`
-    without friction, so that the force depends on the pose alone. With a coefficient of friction,
-    of a bonded tool, and where the force relaxes, it is `fixed`, as docs/haptics.md has it.
+    The second plane is on, and axial motion of a single tool where `EA_L` is given. The contact
+    point is `per_step` without friction, so that the force depends on the pose alone. With a
+    coefficient of friction, of a bonded tool, and where the force relaxes, it is `fixed`, as
+    docs/haptics.md has it.
 
     Args:
         path: of the scene (TOML).
@@ -63,11 +72,8 @@ def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> H
     staged = stage(changed, path.parent, lambda text: begin(text))
     if spec.tool is None:
         notes += (f"the scene has no tool: a finger ({_words(FINGER)}) is used",)
-    rotation, translation = _start(spec, staged, path.parent)
-    return Handled(
-        title=spec.title or path.stem, staged=staged, rotation=rotation,
-        translation=translation, notes=(*staged.notes, *notes),
-    )  # fmt: skip
+    poses = _start(spec, staged, path.parent)
+    return Handled(spec.title or path.stem, staged, poses, (*staged.notes, *notes))
 
 
 def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
@@ -89,28 +95,47 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
         glued = False
         notes.append("contact: unilateral, since a finger is not glued to the wall")
     rubs = _rubs(spec)
-    if rubs and relaxes:
+    if rubs and (relaxes or spec.names):
         rubs = False
-        notes.append("no friction, since the force relaxes")
+        why = "the force relaxes" if relaxes else "several tools slide without"
+        notes.append(f"no friction, since {why}")
     changes["contact_point"] = "fixed" if glued or rubs or relaxes else "per_step"
+    if spec.names:
+        changes["axial"] = "off"
     changes["friction"] = "on" if rubs else "off"
-    away = {"positions": [["0 mm", "1000 mm", "0 mm"]]}
-    legs = [away | {"duration": f"{t} s"} for t in TIMES] if relaxes else [away]
     return spec.model_copy(
         update={
             "effects": wanted.model_copy(update=changes),
             "output": spec.output.model_copy(update={"surface": True, "joints": False}),
             "model": spec.model.model_copy(update={"contact": "bonded" if glued else "unilateral"}),
-            "tool": spec.tool or ToolSection.model_validate(FINGER),
-            "path": [PathSection.model_validate(leg) for leg in legs],
+            "tool": spec.tool or _fingers(spec.names),
+            "path": _far_away(spec.names, TIMES if relaxes else ()),
             "plan": None,
         }
     ), tuple(notes)
 
 
+def _fingers(names: Sequence[str]) -> ToolSection | list[ToolSection]:
+    """A finger, or one of each name."""
+    named = [ToolSection.model_validate(FINGER | {"name": name}) for name in names]
+    return named or ToolSection.model_validate(FINGER)
+
+
+def _far_away(names: Sequence[str], times: Sequence[float]) -> list[PathSection]:
+    """Paths beside the tube that the scene is made with: of each tool a row for each time."""
+    tools: list[dict] = [{"tool": name} for name in names] or [{}]
+    durations: list[dict] = [{"duration": f"{t} s"} for t in times] or [{}]
+    places = [{"positions": [[f"{100 * k} mm", "1000 mm", "0 mm"]]} for k in range(len(tools))]
+    legs = [
+        place | tool | of for place, tool in zip(places, tools, strict=True) for of in durations
+    ]
+    return [PathSection.model_validate(leg) for leg in legs]
+
+
 def _rubs(spec: SceneSpec) -> bool:
     """Whether a tool of this scene sticks and slides by Coulomb's law."""
-    known = isinstance(spec.tool, ToolSection) and spec.tool.friction is not None
+    tools = spec.tool if isinstance(spec.tool, list) else [spec.tool]
+    known = any(tool is not None and tool.friction is not None for tool in tools)
     wished = spec.effects.friction != "off" and spec.effects.contact_point != "per_step"
     return (
         known and wished and (spec.model.contact, spec.model.coupling) == ("unilateral", "series")
@@ -121,33 +146,44 @@ def _words(tool: dict[str, str]) -> str:
     return ", ".join((tool["shape"], *(f"{k} {v}" for k, v in tool.items() if k != "shape")))
 
 
-def _start(spec: SceneSpec, staged: Staged, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The first pose of the scene's path, or one above its first press."""
-    scene = staged.scene
-    first = spec.path[0]
-    if first.kind != "press":
+def _start(spec: SceneSpec, staged: Staged, folder: Path) -> np.ndarray:
+    """The first pose of each tool's path, or one above its first press; shape (tools, 12)."""
+    scene, found = staged.scene, []
+    if spec.path[0].kind != "press":
         path = path_of(spec, folder, [], scene.geometry)
-        assert isinstance(path, Poses)
-        return np.array(path.rotation[0]), np.array(path.translation[0])
-    return np.eye(3), above(scene, first.s or 0.0, first.phi or 0.0, CLEARANCE)
+        for one in path.values() if isinstance(path, dict) else [path]:
+            assert isinstance(one, Poses)
+            found.append(np.append(one.rotation[0], one.translation[0]))
+        return np.stack(found)
+    for tool, name in zip(tools_of(scene), spec.names or [None], strict=True):
+        leg = next(leg for leg in spec.path if leg.tool == name)
+        assert tool is not None
+        over = above(scene, tool, leg.s or 0.0, leg.phi or 0.0, CLEARANCE)
+        found.append(np.append(np.eye(3), over))
+    return np.stack(found)
 
 
-def above(scene: Scene, s: float, phi: float, gap: float) -> np.ndarray:
+def tools_of(scene: Scene) -> list[Shape | None]:
+    """Its tools, or its one, about their origins."""
+    return [one.tool for one in scene.instruments] or [scene.tool]
+
+
+def above(scene: Scene, tool: Shape, s: float, phi: float, gap: float) -> np.ndarray:
     """Position of an unturned tool over a place of the wall at rest, mm; shape (3,).
 
     Args:
-        scene: with tool and mesh.
+        scene: with a mesh.
+        tool: about its origin.
         s: along the centreline, mm.
         phi: from the anterior midline, rad.
         gap: distance of tool and wall along the normal; negative: below the wall at rest.
     """
     mesh = scene.mesh
     assert mesh is not None
-    assert scene.tool is not None
     turn = (np.asarray(mesh.phi) - phi + np.pi) % (2 * np.pi) - np.pi
     near = np.hypot(np.asarray(mesh.s) - s, np.asarray(mesh.distance) * turn).argmin()
     normal, point = np.asarray(mesh.normals[near]), np.asarray(mesh.vertices[near])
-    return point + (gap + float(reach(scene.tool, -normal))) * normal
+    return point + (gap + float(reach(tool, -normal))) * normal
 
 
 def reach(tool: Shape, direction: np.ndarray) -> float:

@@ -150,15 +150,16 @@ class Frames:
         with contextlib.suppress(WebSocketDisconnect):
             while True:
                 try:
-                    pose = read_pose(await page.receive_text())
+                    moved = read_pose(await page.receive_text(), self.live.tools)
                 except (ValueError, KeyError, RecursionError):
                     await page.close(BAD_MESSAGE)
                     return
-                if pose is None:
+                if moved is None:
                     drawn.set()
                     self.event.set()
                 else:
-                    self.live.move(pose)
+                    tool, pose = moved
+                    self.live.move(pose, tool)
 
     async def _write(self, page: WebSocket, drawn: asyncio.Event) -> None:
         shown = None

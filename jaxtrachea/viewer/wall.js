@@ -8,7 +8,7 @@ export default {
     const socket = new WebSocket(`ws://${location.host}/frames`);
     socket.binaryType = "arraybuffer";
     const send = (m) => socket.readyState === 1 && socket.send(JSON.stringify(m));
-    const view = mount(THREE, OrbitControls, this.$el, scene, { onPose: (pose) => send({ pose }) });
+    const view = mount(THREE, OrbitControls, this.$el, scene, { onPose: (tool, pose) => send({ tool, pose }) });
     this.view = window.trachea = view;
     socket.onmessage = (m) => {
       view.frame(m.data);

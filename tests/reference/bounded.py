@@ -39,8 +39,6 @@ def random_study(seed: int, count: int, level: float = 0.01) -> tuple[Study, np.
         synthetic.OPTIONS,
         synthetic.parameters(),
     )
-    # Where bounds cut off the optimum the model misses the curve: no share of its noise.
-    study = dataclasses.replace(study, force_share=None)
     scaled = np.log(truth)
     side = rng.choice([-1, 0, 1], size=scaled.shape, p=[0.25, 0.5, 0.25])
     cut = scaled + side * rng.uniform(0.05, 1.5, scaled.shape)
