@@ -5,6 +5,7 @@ program fits any number of them at once.
 """
 
 import dataclasses
+import functools
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
@@ -333,7 +334,7 @@ def _others(
 ) -> dict[str, Seen]:
     """What curves have beside the force, by field of `Response`; `precision`: of the forces."""
     room, rings = (layout.lanes, layout.trials, layout.samples), layout.geometry.rings
-    level, out = layout.level, {}
+    level, x, out = layout.level, np.asarray(layout.geometry.ring_positions), {}
     for name, parts in FITTED.items():
         if name in level.observes and any(_given(c, q) for c in layout.curves for q in parts):
             out[name] = Seen(*(np.zeros((*room, *sample_shape(name, rings))) for _ in Seen._fields))
@@ -350,8 +351,9 @@ def _others(
             known, weight = np.isfinite(values), precision[at]
             if parts[0].rings is not None:
                 weight = layout.noise.joints_precision(curve.displacement)
-                far = np.stack([_away(curve, layout, q) for q in parts], axis=1)
-                known &= _spread(far if len(parts) > 1 else far[:, 0], values.ndim - 1)
+                far = [_away(x, curve, layout, q) for q in parts]
+                far = np.stack(far, axis=1) if len(parts) > 1 else far[0]
+                known &= _spread(far, values.ndim - 1)
             seen.data[at] = np.where(known, values, 0)
             seen.precision[at] = np.where(known, _spread(weight, values.ndim), 0)
     return out
@@ -363,6 +365,7 @@ def _given(curve: Curve, q: Quantity) -> bool:
     return there and (q.rings is None or getattr(curve, q.rings) is not None)
 
 
+@functools.cache
 def sample_shape(name: str, rings: int) -> tuple[int, ...]:
     """Shape of a sample of a field of `Response`: rings, quantities of several, components."""
     first, *more = FITTED[name]
@@ -386,10 +389,9 @@ def off_midline(curve: Curve) -> bool:
     return curve.phi_c != 0 or tuple(curve.direction) != (1.0, 0.0)
 
 
-def _away(curve: Curve, layout: _Layout, q: Quantity) -> np.ndarray:
-    """Which rings lie beyond the tool, their ends also along the circumference; (rings,)."""
+def _away(x: np.ndarray, curve: Curve, layout: _Layout, q: Quantity) -> np.ndarray:
+    """Which rings at `x` lie beyond the tool, their ends also along the circumference; (rings,)."""
     tube, around = layout.geometry, 0.0
-    x = np.asarray(tube.ring_positions)
     if curve.s_c is None:
         return np.ones(len(x), bool)
     if q.end and layout.pressed_ends:
