@@ -119,7 +119,7 @@ def _unit_table() -> dict[str, tuple[Fraction, tuple[int, int, int, int]]]:
             "newton": Fraction(1),
         },
         "angle": {"deg": degree, "°": degree, "degree": degree, "degrees": degree},
-        "time": {"sec": Fraction(1), "min": Fraction(60), "h": Fraction(3600)},
+        "time": {"sec": Fraction(1), "Sec": Fraction(1), "min": Fraction(60), "h": Fraction(3600)},
         "mass": {"tonne": Fraction(1)},
         "stress": {
             "bar": Fraction(1, 10),

@@ -20,7 +20,6 @@ from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
-from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
 from jaxtrachea.inference import bootstrap
@@ -86,7 +85,7 @@ def test_resampled_residuals_have_the_variance_of_the_noise():
     """Residuals are smaller than the noise by (n - P) / n, and centred in their curve."""
     result = fit(line(np.stack([FORCE, FORCE[::-1]])), ONE)
     residual = np.stack([FORCE, FORCE[::-1]]) - result.value[0, 0] * D
-    seen = Prediction(residual[None], None)
+    seen = {"force": residual[None]}
     noise = bootstrap._blocks(np.random.default_rng(0), result, seen, 0, 20_000, 1)["force"]
     expected = np.var(residual, axis=1) * 24 / 23
     # 240,000 draws of heavy tails tell a variance to 1 %; the factor is 4.3 %.

@@ -108,8 +108,8 @@ def test_errors_of_a_linear_fit_are_those_of_its_hat_matrix(one):
     H = W @ np.linalg.solve(W.T @ W, W.T)
     h, r = np.diag(H), X @ np.linalg.solve(W.T @ W, W.T @ (y / s)) - y
     found = fitted_errors(one, np.array([0]))
-    np.testing.assert_allclose(found.fitted.force[0].ravel(), s * np.sqrt(h), rtol=1e-6)
-    student = found.studentised.force[0].ravel()
+    np.testing.assert_allclose(found.fitted["force"][0].ravel(), s * np.sqrt(h), rtol=1e-6)
+    student = found.studentised["force"][0].ravel()
     np.testing.assert_allclose(student, r / (s * np.sqrt(1 - h)), rtol=1e-6, atol=1e-6)
 
 
@@ -118,8 +118,8 @@ def test_errors_are_those_of_influence_by_other_derivatives(many):
     lanes = np.array([9, 2, 2])
     found = fitted_errors(many, lanes)
     of = influence(many).of
-    np.testing.assert_allclose(found.studentised.force, of.studentised[lanes], atol=1e-6)
-    share = (found.fitted.force / many.sigma[lanes, :1, None]) ** 2
+    np.testing.assert_allclose(found.studentised["force"], of.studentised[lanes], atol=1e-6)
+    share = (found.fitted["force"] / many.sigma[lanes, :1, None]) ** 2
     np.testing.assert_allclose(share, of.leverage[lanes], atol=1e-8)
 
 
@@ -127,7 +127,7 @@ def test_errors_with_markers_and_scaled_unknowns(dense_result):
     """Of a skeleton, unknowns on a logarithmic scale, some of single trials."""
     found, n = fitted_errors(dense_result, np.array([0])), dense_result.study.lanes.force.shape[-1]
     of = influence(dense_result).of
-    np.testing.assert_allclose(found.studentised.force, of.studentised[..., :n], atol=1e-5)
+    np.testing.assert_allclose(found.studentised["force"], of.studentised[..., :n], atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +186,7 @@ def test_markers_under_the_tool_are_hollow(dense_result):
         line for axis in figure.axes for line in axis.lines
         if line.get_markerfacecolor() == "none"
     ]  # fmt: skip
-    used = np.isfinite(dense_result.residuals.joints[0, :, -1]).sum()
+    used = np.isfinite(dense_result.residuals["joints"][0, :, -1]).sum()
     assert used < 45
     assert sum(np.isfinite(line.get_ydata()).sum() for line in hollow) == 45 - used
     assert "not used" in {t.get_text() for t in figure.legends[0].get_texts()}
@@ -240,7 +240,7 @@ def test_captions_follow_what_was_observed(one, many, dense_result):
     assert list(captions(many)) == ["fit", "residuals", "correlation"]
     assert list(captions(one)) == ["fit", "correlation"]
     assert list(captions(dense_result)) == ["fit", "joints", "correlation"]
-    seen = dataclasses.replace(one.residuals, side_force=one.residuals.force)
+    seen = one.residuals | {"side_force": one.residuals["force"]}
     both = dataclasses.replace(one, stored_residuals=seen)
     assert list(captions(both)) == ["fit", "side_force", "correlation"]
 

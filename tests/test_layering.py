@@ -254,6 +254,15 @@ def test_no_function_takes_too_many_arguments():
     assert not [row for row in counts if row[2] > MOST_ARGUMENTS]
 
 
+def test_an_observed_quantity_is_named_in_four_files():
+    """Its row, its field of a curve, that of a response, and its level; all others loop."""
+    files = [path for path in PACKAGE.rglob("*.py") if "side_force" in path.read_text()]
+    assert sorted(str(path.relative_to(PACKAGE)) for path in files) == [
+        "measurements/curve.py", "measurements/observed.py",
+        "mechanics/levels/level.py", "mechanics/levels/sections.py",
+    ]  # fmt: skip
+
+
 def test_arguments_are_counted():
     source = "class C:\n    async def m(self, a, /, b, *rest, c=1, **more): return lambda x, y=0: x"
     assert dict(argument_counts(source)) == {"m": 3, "lambda": 2}

@@ -140,6 +140,24 @@ READ = {
         LVM + LVM_TABLE + rows(comma(T), comma(D), comma(F), sep="\t"), {}, ONE),
     "LabVIEW, two segments": (
         LVM + LVM_TABLE + TABBED + "\t\n" + LVM_TABLE + rows(T, D, TWO["2"][1], sep="\t"), {}, TWO),
+    "Hysitron, volts beside": (
+        "Displacement (nm)\tLoad (µN)\tTime (s)\tDisplacement (V)\tLoad (V)\n"
+        + rows([1e6 * d for d in D], [1e6 * f for f in F], T, T, T, sep="\t"), {}, ONE),
+    "TestSuite, Sec": (
+        "Data Header:\tTime:\t1.1\tSec\n\nTime\tAxial Displacement\tAxial Force\nSec\tmm\tN\n"
+        + TABBED,
+        {"columns": {"displacement": "Axial Displacement", "force": "Axial Force"}}, ONE),
+    "WinTest, points": (
+        "WinTest\nTest,EF_1\nPoints,Elapsed Time,Disp,Load\n,Sec,mm,N\n" + rows(T, T, D, F),
+        {"columns": {"displacement": "Disp"}}, ONE),
+    "Trapezium, tests side by side": (
+        '"","T_1","","","T_2","",""\n"","Time","Force","Stroke","Time","Force","Stroke"\n'
+        '"","sec","N","mm","sec","N","mm"\n'
+        + "".join("," + line + "\n" for line in rows(T, F, D, T, TWO["2"][1], D).split()),
+        {"columns": {"time": "Time"}}, {"T_1": TWO["1"], "T_2": TWO["2"]}),
+    "TestXpert in German": (
+        "Prüfer;M.\n\nPrüfzeit;Standardweg;Standardkraft\ns;mm;N\n" + SEMI,
+        {"columns": {"displacement": "Standardweg", "force": "Standardkraft"}}, ONE),
     "delimiter at the end": (
         "Displacement [mm];Force [N];\n" + rows(D, F, sep=";", end=";\n"), {}, ONE),
 }  # fmt: skip
@@ -149,6 +167,10 @@ REFUSED = {
     "German names": (
         "Standardweg [mm];Standardkraft [N]\n" + rows(comma(D), comma(F), sep=";"),
         "the columns of line 1 are 'Standardweg', 'Standardkraft'"),
+    "depth, and volts beside": (
+        "Depth (nm)\tLoad (µN)\tDepth (V)\tLoad (V)\n"
+        + rows([1e6 * d for d in D], [1e6 * f for f in F], T, T, sep="\t"),
+        "the columns of line 1 are 'Depth', 'Load', 'Depth', 'Load'"),
     "axes of a load cell": (MACH_1, "the columns of line 9 are 'Time', 'Position (z)', 'Fz'"),
     "no header": (rows(D, F), "the table begins with numbers in line 1, in columns 1 to 2"),
     "no unit of force": ("Displacement [mm],Force\n" + rows(D, F), "column 'Force' has no unit"),
@@ -222,6 +244,7 @@ def test_grams_and_lines_left_out_are_said(tmp_path):
         ("#specimen,displacement [mm],force [N]\nT1,0,0\nT1,1,2\n",
          "line 1 is the header of a table with 'specimen' (specimen), but is a comment"),
         ("Displacement [mm],Force [N],Force [N]\n0,0,0\n1,2,3\n", "can all be the force"),
+        ("Stroke [mm],Load [mN],Load [N]\n0,0,0\n1,2,3\n", "'Load [mN]', 'Load [N]' can all"),
         ('Displacement [mm],Force [N]\n0,"1,4,3"\n1,2\n', "Force '1,4,3' is not a number"),
         ('Displacement [mm],Force [N]\n0,"1,234"\n1,"2,345"\n', "'1,234' is not a number"),
         ('Displacement [mm],Force [N]\n0,0.5\n1,"1,234"\n', "'1,234' is not a number"),

@@ -69,7 +69,7 @@ def test_loops_over_lanes_compile_once(study, compiled, loop):
     """40 lanes, 16 at a time: the last 8 are filled up."""
     theta, sigma = guess(study), np.ones((40, 2))
     if loop == "predictions":
-        assert predictions(study, theta, 16).force.shape == (40, 4, 50)
+        assert predictions(study, theta, 16)["force"].shape == (40, 4, 50)
     else:
         assert informations(study, np.arange(40), theta, sigma, 16).bread.shape == (40, 4, 4)
     assert len(compiled) == 1

@@ -106,7 +106,7 @@ def largest_errors(data):
             found["side"] = np.abs(side / normal[deep] - measured / force[deep]).max()
         else:
             curve["joint_side_residual"] = np.zeros(len(D))  # 0 by symmetry, not measured
-        for name in ("joint_residual", "joint_side_residual", "ends_residual"):
+        for name in ("joint_residual", "joint_side_residual", "end_residual"):
             error = curve[name].reshape(len(D), -1)[D > 0] / D[D > 0, None]
             found[name] = np.sqrt(np.nanmean(error**2, axis=1)).max()
         most = {name: max(most.get(name, 0), found.get(name, 0)) for name in most | found}

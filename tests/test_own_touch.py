@@ -79,7 +79,7 @@ def left_out_pairs(study, changes, rows, folder):
     held = np.zeros(study.take(left.lane).lanes.s_c.shape, bool)
     held[np.arange(len(held)), left.trial] = True
     chosen = study.take(left.lane)
-    truth = predictions(chosen, with_own_onset(chosen, held, left.result.theta, TWO).theta).force
+    truth = predictions(chosen, with_own_onset(chosen, held, left.result.theta, TWO).theta)["force"]
     for row in rows:
         lane, trial = left.lane[row], left.trial[row]
         out = study.curves[lane][trial]

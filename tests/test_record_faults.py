@@ -141,7 +141,8 @@ def test_uneven_noise_and_its_weights():
     assert "'estimate per curve'" in sentence
     assert list(uneven_noise([curves[0], trial("also", seed=3, s=60.0)])) == []
     lane = dict.fromkeys(Lane._fields)
-    lane |= {"s_c": np.zeros((1, 2)), "precision": np.ones((1, 2, 200))}
+    ones = np.ones((1, 2, 200))
+    lane |= {"others": {}, "s_c": np.zeros((1, 2)), "precision": ones, "force": ones}
     precision = weighed_by_curve(Lane(**lane), [curves], joint=False).precision
     # The floor of 0.2 % of the largest force is 0.0036 N.
     ratio = 0.1 / np.hypot(SIGMA, 0.0036)

@@ -266,7 +266,7 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
     assert "more" not in rows[1]
     assert "force_offset [N]" in rows[1]
     assert [r["samples"] for r in rows] == [24, 12, 12]
-    own = [np.sqrt(np.mean(np.square(seen.force[0, t]))) for t in ([0, 1], [2], [3])]
+    own = [np.sqrt(np.mean(np.square(seen["force"][0, t]))) for t in ([0, 1], [2], [3])]
     np.testing.assert_allclose([r["rms_force_N"] for r in rows], own, rtol=1e-12)
 
 
@@ -352,7 +352,7 @@ def test_alike_residuals_far_below_the_noise_given_hardly_count():
     noise = 0.05 * autoregressive((2, 100), 0.8, 5) * np.array([[0.1], [1.0]])
     curves = [Curve(f"s{k}", "a", None, 0.0, depth, 1.3 * depth + noise[k]) for k in range(2)]
     result = fit(build_study(curves, table_1(), BONDED, table(), noise=Noise(force=0.05)), ONE)
-    part = np.nansum(result.residuals.force**2, axis=(1, 2)) / 98 / 0.05**2
+    part = np.nansum(result.residuals["force"] ** 2, axis=(1, 2)) / 98 / 0.05**2
     expected = np.sqrt(1 + np.minimum(part, 1) * (100 / result.effective.samples - 1))
     np.testing.assert_allclose(result.effective.growth, expected, rtol=1e-9)
     assert result.effective.growth[0] < 1.1

@@ -184,9 +184,9 @@ def test_predictions_are_model_minus_data(result):
         for t, curve in enumerate(result.study.curves[lane]):
             model = k_1 * curve.displacement + k_3 * curve.displacement**3 + offsets[t]
             # The smooth touch (1 micrometre) shifts the displacement by less than 1e-5 mm here.
-            assert np.allclose(seen.force[lane, t], model - curve.force, atol=1e-4)
+            assert np.allclose(seen["force"][lane, t], model - curve.force, atol=1e-4)
     assert "N were measured" in worst(seen, result)
-    nothing = dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))
+    nothing = seen | {"force": np.full_like(seen["force"], np.nan)}
     assert worst(nothing, result) == "none, no finite prediction"
 
 
@@ -194,7 +194,7 @@ def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
     seen = predictions(result.study, result.theta)
     for name, one in (
         ("all", seen),
-        ("none", dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))),
+        ("none", seen | {"force": np.full_like(seen["force"], np.nan)}),
     ):
         (tmp_path / name).mkdir()
         paths, lost = draw_all(tmp_path / name, predicted(result, one))
@@ -324,9 +324,9 @@ def test_correlated_residuals_are_found():
 
 def test_report_doubts_what_it_should(result):
     seen = predictions(result.study, result.theta)
-    shape = seen.force.shape
-    bend = dataclasses.replace(seen, force=np.tile(np.linspace(1, 2, shape[-1]), (*shape[:2], 1)))
-    noise = dataclasses.replace(seen, force=np.tile([1.0, -1.0], (*shape[:2], shape[-1] // 2)))
+    shape = seen["force"].shape
+    bend = seen | {"force": np.tile(np.linspace(1, 2, shape[-1]), (*shape[:2], 1))}
+    noise = seen | {"force": np.tile([1.0, -1.0], (*shape[:2], shape[-1] // 2))}
     text = report_text("T", predicted(result, bend), [])
     assert "misses the curves in 2 of 2 fits" in text
     assert "on its bound" not in text

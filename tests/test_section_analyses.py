@@ -212,7 +212,9 @@ def test_entries_of_influence_have_names():
     }
     first = 0
     for name, (shape, names) in shapes.items():
-        assert getattr(study.lanes, name).shape == (1, 1, *shape)
+        lanes = study.lanes
+        seen = lanes.force if name == "force" else lanes.others[name].data
+        assert seen.shape == (1, 1, *shape)
         for i in range(int(np.prod(shape))):
             sample, place = divmod(i, len(names))
             observed, ring = names[place]

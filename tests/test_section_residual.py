@@ -15,6 +15,7 @@ from jaxtrachea.fitting import information, shared, structure
 from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.effective import effective_samples
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.force_share import with_shares
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.lane import (
     data_weight,
@@ -26,10 +27,10 @@ from jaxtrachea.fitting.lane import (
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.model import values_of
 from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
-from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.refusals import Size, check_curve
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
 from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Shares
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.comparison import same_data
 from jaxtrachea.inference.posterior import posterior
@@ -41,6 +42,7 @@ from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMateri
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.results.store import _observed
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -95,13 +97,13 @@ def test_markers_err_by_a_share_of_the_displacement(share):
     given = Noise(force=0.05, joints=0.2, joints_share=share)
     lanes = build_study([curve(PLACES[1])], GEOMETRY, SECTIONS, NAMED, noise=given).lanes
     variance = 0.2**2 + (share * PATH) ** 2
-    for name in ("joint_precision", "joint_side_precision", "end_precision"):
-        kept = getattr(lanes, name)[0, 0].reshape(len(PATH), -1)
+    for name in ("joints", "joint_side", "ends"):
+        kept = lanes.others[name].precision[0, 0].reshape(len(PATH), -1)
         kept = kept[:, kept[0] > 0]
         assert kept.shape[1] >= 2
         np.testing.assert_allclose(kept, np.tile(variance[:, None] ** -0.5, kept.shape[1]))
     np.testing.assert_allclose(lanes.precision[0, 0], 1 / 0.05)
-    np.testing.assert_allclose(lanes.side_precision[0, 0], 1 / 0.05)
+    np.testing.assert_allclose(lanes.others["side_force"].precision[0, 0], 1 / 0.05)
 
 
 @pytest.mark.parametrize(("share", "says"), [(-0.1, "0 or more"), (0.1, "needs joints")])
@@ -289,11 +291,12 @@ def test_known_parameters_are_found(tmp_path):
     for i, c in enumerate(curves):
         row = slice(i * n, (i + 1) * n)
         np.testing.assert_array_equal(data["side_force"][row], c.side_force)
-        aside = c.joint_side_displacement if c.phi_c else np.full((n, 3), np.nan)  # 0 by symmetry
-        np.testing.assert_array_equal(data["joint_side"][row], aside)
+        np.testing.assert_array_equal(data["joint_side"][row], c.joint_side_displacement)
+        unread = np.isnan(data["joint_side_residual"][row])  # by symmetry it is 0 on the midline
+        assert np.all(unread == (c.phi_c == 0))
         np.testing.assert_array_equal(data["ends"][row, :, 1], c.end_V)
         np.testing.assert_array_equal(data["direction"][i], c.direction)
-    for name in ("side", "joint_side", "ends"):
+    for name in ("side", "joint_side", "end"):
         assert np.nanmax(np.abs(data[f"{name}_residual"])) < 1e-4
 
 
@@ -304,30 +307,56 @@ def test_lanes():
     assert plain.direction is None
     near = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0).lanes
     np.testing.assert_array_equal(near.phi_c, [[0.5]])
-    for seen in (near.joint_precision, near.joint_side_precision):
+    for seen in (near.others["joints"].precision, near.others["joint_side"].precision):
         np.testing.assert_array_equal(np.any(seen > 0, axis=(0, 1, 2)), [False, False, True])
-    assert np.sum(near.end_precision > 0) == 3 * 4
+    assert np.sum(near.others["ends"].precision > 0) == 3 * 4
     # Under the tool, off the midline: both ends are far round the ring, V 15 mm, U 34 mm.
     under = curve((20.5, 0.8, (1.0, 0.0)))
     for given, count in ((True, 3 * 4), (False, 0)):
         seen = study_of([under], tool_radius=1.0, weighting=Weighting(pressed_ends=given))
-        assert np.sum(seen.lanes.end_precision > 0) == count
+        assert np.sum(seen.lanes.others["ends"].precision > 0) == count
     without = Weighting(pressed_ends=False)
     beside = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0, weighting=without)
-    assert np.sum(beside.lanes.end_precision > 0) == 3 * 4
+    assert np.sum(beside.lanes.others["ends"].precision > 0) == 3 * 4
     with pytest.raises(ValueError, match="pressed_ends=False needs tool_radius"):
         study_of([under], weighting=without)
     at_end = curve((20.0, np.pi / 2, (1.0, 0.0)))  # 30 degrees from it, 5.9 mm
-    ends = study_of([at_end], tool_radius=7.0).lanes.end_precision
+    ends = study_of([at_end], tool_radius=7.0).lanes.others["ends"].precision
     assert np.sum(ends[..., 0, :] > 0) == np.sum(ends > 0) == 3 * 2
     bare = {name: None for name in ("side_force", "joint_side_displacement", "end_U", "end_V",
                                     "end_rings", "joint_rings", "joint_displacement")}  # fmt: skip
     force = study_of([curve(PLACES[1], **bare)]).lanes
-    assert force.joints is force.side_force is force.ends is None
+    assert force.others == {}
     only_ends = bare | {"end_rings": np.array([0]), "end_U": np.ones((3, 1, 2))}
     lanes = study_of([curve(PLACES[1], **only_ends)]).lanes
-    assert np.sum(lanes.end_precision > 0) == 6
-    assert np.sum(lanes.joint_precision > 0) == 0
+    assert np.sum(lanes.others["ends"].precision > 0) == 6
+    assert np.sum(lanes.others["joints"].precision > 0) == 0
+
+
+def test_a_share_of_the_force_weighs_side_forces_too():
+    study = study_of([curve(PLACES[1])])
+    plain = np.asarray(study.lanes.precision)
+    found = with_shares(study, Shares(np.array([0.1]), None, plain), plain / 2).lanes
+    np.testing.assert_array_equal(found.others["side_force"].precision, plain / 2)
+    np.testing.assert_array_equal(found.others["ends"].precision[0, 0, :, 1], 1 / 0.2)
+
+
+def test_curves_of_a_stored_fit_have_what_it_read(tmp_path):
+    """Of markers and ends what has a residual; the side force as measured."""
+    n, rings, rng = 4, 3, np.random.default_rng(5)
+    joints, ends = rng.normal(size=(n, rings)), rng.normal(size=(n, rings, 2, 2))
+    left = {"joint": np.zeros((n, rings)), "end": np.zeros(ends.shape)}
+    left["joint"][:, 1], left["end"][2, 0, 1, 0] = np.nan, np.nan
+    with h5py.File(tmp_path / "data.h5", "w") as file:
+        stored = {"joints": joints, "ends": ends, "side_force": np.arange(4.0)}
+        for name, values in (stored | {f"{k}_residual": v for k, v in left.items()}).items():
+            file[name] = values
+        found = _observed(file)
+    np.testing.assert_array_equal(found["joint_displacement"], joints + left["joint"])
+    np.testing.assert_array_equal(found["end_U"], ends[:, :, 0])
+    np.testing.assert_array_equal(found["end_V"], (ends + left["end"])[:, :, 1])
+    np.testing.assert_array_equal(found["side_force"], np.arange(4.0))
+    np.testing.assert_array_equal(found["end_rings"], range(rings))
 
 
 def test_weight_of_the_data_is_that_of_all_forces():
@@ -474,7 +503,7 @@ def test_a_kind_of_few_samples_is_taken_for_as_alike_as_the_forces():
     force = alike[None, None]
     for more, count in (({}, n), ({"ends": ends}, n + 4 * n / 10),
                         ({"side_force": np.zeros((1, 1, n))}, 2 * n)):  # fmt: skip
-        found = effective_samples(Prediction(force, None, **more))
+        found = effective_samples({"force": force, **more})
         np.testing.assert_allclose(found, count * share, rtol=0.15)
 
 

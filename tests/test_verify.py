@@ -17,7 +17,6 @@ from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import in_model
-from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.population import population
@@ -163,7 +162,7 @@ def test_widened_intervals_hold_the_plain_ones(result):
     end[5, 3] = ProfileEnd.FAILED
     given = dataclasses.replace(result, evidence_low=low, evidence_high=high, evidence_end=end)
     slow = np.sin(np.arange(result.study.lanes.force.shape[2]))
-    seen = Prediction(np.where(result.study.lanes.precision > 0, slow, np.nan), None)
+    seen = {"force": np.where(result.study.lanes.precision > 0, slow, np.nan)}
     given.__dict__["residuals"] = seen
     wide = given.effective
     bounds = [(p.lower, p.upper) for p in given.study.free]

@@ -16,6 +16,7 @@ from jaxtrachea.cli.options import with_fields
 from jaxtrachea.cli.sources import Sources, read_sources
 from jaxtrachea.cli.terminal import Stop, set_up_jax, table, to_stderr
 from jaxtrachea.cli.written_spec import specification_text, summary
+from jaxtrachea.measurements.observed import OBSERVED
 
 #: Rows of a table of columns, and tables of columns; a file has more in itself.
 MANY, TABLES = 40, 3
@@ -26,11 +27,9 @@ OF_NAMES = r"--specimen '(?P<specimen>.+)_(?P<trial>s(?P<s>\d+))' --unit s=mm"
 ROLES = {
     "displacement": "displacement of the tool",
     "force": "force",
-    "side_force": "side force",
-    "sigma": "noise of the force",
+    **{q.role: q.words for q in OBSERVED if q.rings is None},
     "s": "position s along the tube",
     "phi": "angle phi",
-    "time": "time",
     "specimen": "specimen",
     "trial": "trial",
     "segment": "approach or retraction",

@@ -185,7 +185,7 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
         rows = {"predictions": [], "bands": [], "joints": []}
         for c in compared:
             p = c.prediction
-            rows["predictions"] += tables.prediction_rows(p, c.curve.force, c.curve.side_force)
+            rows["predictions"] += tables.prediction_rows(p, c.curve)
             rows["bands"] += tables.band_rows(p)
             deepest = [int(np.argmax(np.abs(p.displacement)))]
             rows["joints"] += tables.joint_rows(p, rings, deepest, _markers(c, len(rings)))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.fitting.lane import FORCES, Lane
+from jaxtrachea.fitting.lane import Lane, forces, with_observed
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.trials.uneven_noise import noise_to_weigh
 
@@ -39,8 +39,5 @@ def weighed_by_curve(lanes: Lane, groups: Sequence[Sequence[Curve]], *, joint: b
     if joint:
         square, total = (np.sum(v, axis=0, keepdims=True) for v in (square, total))
     factor = (np.sqrt(square / np.maximum(total, 1)) / sigma)[..., None]
-    weighed = {}
-    for _, name in FORCES:
-        if (precision := getattr(lanes, name)) is not None:
-            weighed[name] = precision * factor
-    return lanes._replace(**weighed)
+    weighed = {kind.name: kind.precision * factor for kind in forces(lanes)}
+    return with_observed(lanes, precision=weighed)

@@ -17,7 +17,6 @@ then says what noise of that size and slowness would do. Where less than one ind
 left over the unknowns, nothing is said at all (`Effective.misses`).
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -99,17 +98,14 @@ def share_independent(
 
 def effective_samples(seen: Prediction) -> Float[np.ndarray, " lanes"]:
     """Independent samples that the forces, and the markers of each ring, are worth; (lanes,)."""
-    kinds = [seen.force]
-    for more in (seen.side_force, seen.joints, seen.joint_side, seen.ends):
-        if more is not None:
-            lanes, trials, samples = more.shape[:3]
-            rows = np.moveaxis(more.reshape(lanes, trials, samples, -1), -1, 2)
-            kinds.append(rows.reshape(lanes, -1, samples))
-    total = np.zeros(len(seen.force))
-    of_forces = _share(seen.force)
-    for residual in kinds:
+    of_forces = _share(seen["force"])
+    total = np.zeros(len(of_forces))
+    for name, found in seen.items():
+        lanes, trials, samples = found.shape[:3]
+        rows = np.moveaxis(found.reshape(lanes, trials, samples, -1), -1, 2)
+        residual = rows.reshape(lanes, -1, samples)
         count = np.sum(np.isfinite(residual), axis=(1, 2))
-        share = of_forces if residual is seen.force else _share(residual)
+        share = of_forces if name == "force" else _share(residual)
         # Too few neighbours of one kind, or no residual at all: taken for as alike as the forces.
         share = np.where(np.isnan(share), of_forces, share)
         total += np.where(count > 0, count * share, 0)
@@ -124,9 +120,8 @@ def _share(residual: Float[np.ndarray, "lanes trials samples"]) -> Float[np.ndar
 
 def _together(of: Residuals) -> Prediction:
     """Residuals of all specimens of a joint fit as the trials of one."""
-    seen = {f.name: getattr(of.seen, f.name) for f in dataclasses.fields(of.seen)}
-    alive = {name: v[of.succeeded] for name, v in seen.items() if v is not None}
-    return Prediction(**seen | {k: v.reshape(1, -1, *v.shape[2:]) for k, v in alive.items()})
+    alive = {name: v[of.succeeded] for name, v in of.seen.items()}
+    return {name: v.reshape(1, -1, *v.shape[2:]) for name, v in alive.items()}
 
 
 def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
@@ -167,5 +162,5 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
     with np.errstate(invalid="ignore", divide="ignore"):
         growth = np.where(misses, np.inf, np.maximum(factor * quantile / plain, 1))
         share = worth / n
-    seen = lag_correlation(of.seen.force)
+    seen = lag_correlation(of.seen["force"])
     return Effective(seen, worth, share, factor, quantile, growth, misses)

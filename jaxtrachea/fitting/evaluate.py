@@ -64,7 +64,7 @@ def _whitened(study: Study, off: Prediction) -> tuple[list[np.ndarray], list[np.
             continue
         rows, there = [], []
         for kind in kinds:
-            observed, residual = kind.precision > 0, getattr(off, kind.name)
+            observed, residual = kind.precision > 0, off[kind.name]
             rows.append(np.where(observed, residual * kind.precision, 0).reshape(shape))
             there.append(observed.reshape(shape))
         parts.append(np.concatenate(rows, axis=2).reshape(len(lanes.s_c), -1))
@@ -84,7 +84,7 @@ def _information(study: Study, off: Prediction) -> Information:
     def plain(kinds):
         total = zero
         for kind in kinds:
-            off_by = np.where(kind.precision > 0, getattr(off, kind.name), 0)
+            off_by = np.where(kind.precision > 0, off[kind.name], 0)
             total = total + np.sum(off_by**2, axis=tuple(range(1, off_by.ndim)))
         return total
 

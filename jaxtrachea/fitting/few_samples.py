@@ -29,7 +29,7 @@ def serves(study: Study, settings: Settings, starts: int) -> bool:
     """
     lanes, model = study.lanes, study.model
     long = lanes.force.shape[-1] >= TIMES * KEPT and starts > UNOPTIMISED_LANES
-    forces_alone = lanes.joints is None and lanes.time is None and not model.level.iterates
+    forces_alone = "joints" not in lanes.others and lanes.time is None and not model.level.iterates
     tells = forces_alone and lanes.blend is None and model.loss == "linear" and settings.verify
     solver = settings.method == "levenberg-marquardt" and not settings.float32
     return long and tells and solver and not study.joint and on_cpu()

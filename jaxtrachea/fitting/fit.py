@@ -235,7 +235,7 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     solved, agree, tried, sigma = minima[:4]
     info, pool, unknowns = information_per_lane(study, solved, sigma)
     before, sigma = sigma, next_sigma(study, pool, sigma, unknowns)
-    if study.model.loss == "linear" and study.lanes.joints is None:
+    if study.model.loss == "linear" and "joints" not in study.lanes.others:
         ratio = before[:, 0] / sigma[:, 0]
         info, pool = info.rescaled(ratio), pool.rescaled(ratio)
     else:

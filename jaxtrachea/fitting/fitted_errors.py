@@ -1,6 +1,6 @@
 """How well a fit knows its own curves: standard errors of what it says at the measured points."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -43,11 +43,10 @@ def fitted_errors(result: FitResult, lanes: Int[np.ndarray, " n"]) -> FittedErro
     """
     study = result.study
     slopes, covariance = _slopes(result, lanes), _covariance(result, lanes)
-    fitted: dict[str, Any] = {"force": None, "joints": None}
-    studentised = dict(fitted)
+    fitted, studentised = {}, {}
     for k, kinds in enumerate((forces(study.lanes), markers(study.lanes))):
         for kind in kinds:
-            residual = getattr(result.residuals, kind.name)[lanes]
+            residual = result.residuals[kind.name][lanes]
             error = _error(slopes[kind.name], covariance) if slopes else np.zeros(residual.shape)
             sigma = result.whitened_sigma[lanes, k].reshape(-1, *(1,) * (residual.ndim - 1))
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -56,7 +55,7 @@ def fitted_errors(result: FitResult, lanes: Int[np.ndarray, " n"]) -> FittedErro
                 over = residual / noise / np.sqrt(np.where(kept > _KEPT, kept, np.nan))
             fitted[kind.name] = np.where(np.isfinite(residual), error, np.nan)
             studentised[kind.name] = over
-    return FittedErrors(Prediction(**fitted), Prediction(**studentised))
+    return FittedErrors(fitted, studentised)
 
 
 def _columns(study: Study, lanes) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +84,7 @@ def _slopes(result: FitResult, lanes) -> dict[str, Float[np.ndarray, "F n T ..."
         ends = np.concatenate([result.theta[lanes] + move, result.theta[lanes] - move])
         found = predictions(twice, ends, like=result.lanes)
         for name, parts in slopes.items():
-            up, down = np.split(getattr(found, name), 2)
+            up, down = np.split(found[name], 2)
             parts.append(
                 (up - down) / width[..., f].reshape(*place.shape[:2], *[1] * (up.ndim - 2))
             )

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxtrachea.fitting.lane import forces, with_observed
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.result import FitResult
@@ -67,10 +68,11 @@ def as_weighed(study: Study) -> Study:
 
 def with_shares(study: Study, shares: Shares, precision: Float[np.ndarray, "lanes T N"]) -> Study:
     """The study with shares, and the precision of the forces that they made."""
-    changed = {"precision": precision}
-    if study.lanes.side_precision is not None:
-        changed["side_precision"] = np.where(study.lanes.side_precision > 0, precision, 0)
-    return dataclasses.replace(study, lanes=study.lanes._replace(**changed), shares=shares)
+    changed = {
+        kind.name: np.where(kind.precision > 0, precision, 0) for kind in forces(study.lanes)[1:]
+    }
+    lanes = with_observed(study.lanes, precision=changed | {"force": precision})
+    return dataclasses.replace(study, lanes=lanes, shares=shares)
 
 
 def with_found_shares(
@@ -112,7 +114,7 @@ def next_levels(result: FitResult) -> tuple[Levels, Float[np.ndarray, "lanes T N
     A share that is given is kept; one that gains less than `WORTH` is 0.
     """
     study = result.study
-    residual = result.residuals.force
+    residual = result.residuals["force"]
     force = np.asarray(study.lanes.force) - offsets(study, result.theta)[..., None]
     force = np.where(np.isfinite(residual), force + residual, force)
     plain = study.lanes.precision if study.shares is None else study.shares.plain

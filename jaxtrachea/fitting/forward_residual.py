@@ -83,19 +83,17 @@ def force_jacobian(
     value: Float[Array, " J"],
     motion: Motion,
     tube: Geometry,
+    names: tuple[str, ...],
 ) -> Float[Array, "Jf m"]:
-    """Derivative of the forces by the free columns, of a press without data.
+    """Derivative of the force, and of `names`, by the free columns, of a press without data.
 
-    Of the force along the tool, (Jf, N); off the midline of the side force too, after it,
-    (Jf, 2 N). NaN at samples without equilibrium, and too deep.
+    Of one after the other. NaN at samples without equilibrium, and too deep.
     """
 
     def at(free):
         found = answer(model, free, value, motion, tube)
-        if motion.phi_c is None or found.side_force is None:
-            return found.force, found.status
-        both = jnp.concatenate([found.force, found.side_force])
-        return both, jnp.concatenate([found.status] * 2)
+        seen = [found.force, *(getattr(found, name) for name in names)]
+        return jnp.concatenate(seen), jnp.concatenate([found.status] * len(seen))
 
     def push(tangent):
         _, slope, status = jax.jvp(at, (free,), (tangent,), has_aux=True)

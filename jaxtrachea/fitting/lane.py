@@ -1,14 +1,25 @@
 """A lane: the arrays of all that is fitted together, and what of them is observed.
 
-The residual of a trial is one row: force, side force, then what markers and ring ends show. What
-is `None` in a lane is not in the row.
+The residual of a trial is one row: the force, other numbers of a sample, then what rings show, in
+the order of `FITTED`. What is not in `Lane.others` is not in the row.
 """
 
+import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from jaxtrachea.measurements.observed import FITTED
+
+
+class Seen(NamedTuple):
+    """Values of one kind of observation in its unit, and the precision of each."""
+
+    data: Any
+    precision: Any
 
 
 class Lane(NamedTuple):
@@ -22,8 +33,8 @@ class Lane(NamedTuple):
         displacement: mm; (T, N).
         force: N; (T, N).
         precision: 1 / sigma of each force sample, or 1 where the noise is estimated; (T, N).
-        joints: marker displacement, mm; (T, N, rings); None without markers and ring ends.
-        joint_precision: as `precision`; None without markers and ring ends.
+        others: what is observed beside the force, by field of `Response` (`FITTED`), (T, N) and
+            the shape of a sample, see there; what no curve has is not in it.
         balance: weight of each trial against the others; (T,).
         blend: smooth first touch of each trial, mm, see `first_touch`; (T,); None where no onset is
             fitted.
@@ -36,22 +47,15 @@ class Lane(NamedTuple):
             model has no time.
         rising: which samples are of the first loading, 1 or 0; (T, N); with `time`.
         phi_c: contact angle, rad; (T,); None where all trials of the study press along the normal
-            on the midline. This and all below: deforming cross-sections alone.
+            on the midline.
         direction: of the tool along the inward normal and the circumference; (T, 2); with `phi_c`.
-        side_force: N, see `Curve`; (T, N); None where no curve has it.
-        side_precision: as `precision`; (T, N).
-        joint_side: marker displacement along the circumference, mm; (T, N, rings).
-        joint_side_precision: as `precision`.
-        ends: motion of ring ends, mm: U and V, each y and z; (T, N, rings, 2, 2).
-        end_precision: as `precision`.
     """
 
     s_c: Float[Array, "*l T"]
     displacement: Float[Array, "*l T N"]
     force: Float[Array, "*l T N"]
     precision: Float[Array, "*l T N"]
-    joints: Float[Array, "*l T N rings"] | None
-    joint_precision: Float[Array, "*l T N rings"] | None
+    others: dict[str, Seen]
     balance: Float[Array, "*l T"]
     blend: Float[Array, "*l T"] | None
     value: Float[Array, "*l T J"]
@@ -63,21 +67,6 @@ class Lane(NamedTuple):
     rising: Float[Array, "*l T N"] | None = None
     phi_c: Float[Array, "*l T"] | None = None
     direction: Float[Array, "*l T 2"] | None = None
-    side_force: Float[Array, "*l T N"] | None = None
-    side_precision: Float[Array, "*l T N"] | None = None
-    joint_side: Float[Array, "*l T N rings"] | None = None
-    joint_side_precision: Float[Array, "*l T N rings"] | None = None
-    ends: Float[Array, "*l T N rings 2 2"] | None = None
-    end_precision: Float[Array, "*l T N rings 2 2"] | None = None
-
-
-#: Fields that are observed, each with that of its precision, in the order of the residual's row.
-FORCES = (("force", "precision"), ("side_force", "side_precision"))
-MARKERS = (
-    ("joints", "joint_precision"),
-    ("joint_side", "joint_side_precision"),
-    ("ends", "end_precision"),
-)
 
 
 class Observed(NamedTuple):
@@ -97,25 +86,37 @@ class Observed(NamedTuple):
 
 
 def forces(lane: Lane) -> list[Observed]:
-    """Forces that a lane may observe, in the order of the residual's row."""
-    return _present(lane, FORCES)
+    """Forces that a lane observes, in the order of the residual's row."""
+    force = Observed("force", lane.force, lane.precision, 1)
+    return [force, *_others(lane, of_rings=False)]
 
 
 def markers(lane: Lane) -> list[Observed]:
-    """Motions that a lane may observe, likewise."""
-    return _present(lane, MARKERS)
+    """Motions of rings that a lane may observe, likewise."""
+    return _others(lane, of_rings=True)
 
 
-def _present(lane: Lane, kinds) -> list[Observed]:
+def _others(lane: Lane, *, of_rings: bool) -> list[Observed]:
     axes, out = lane.force.ndim, []
-    for name, weight in kinds:
-        data, precision = getattr(lane, name), getattr(lane, weight)
-        if data is not None and precision is not None:
-            places = 1
-            for n in data.shape[axes:]:
-                places *= n
-            out.append(Observed(name, data, precision, places))
+    for name, parts in FITTED.items():
+        if name in lane.others and (parts[0].rings is not None) == of_rings:
+            data, precision = lane.others[name]
+            out.append(Observed(name, data, precision, math.prod(data.shape[axes:])))
     return out
+
+
+def with_observed(
+    lane: Lane, data: Mapping[str, Any] | None = None, precision: Mapping[str, Any] | None = None
+) -> Lane:
+    """The lane, or lanes, with other values or precisions of some kinds, by name."""
+    data, precision = dict(data or {}), dict(precision or {})
+    own = {"force": data.pop("force", lane.force)}
+    own["precision"] = precision.pop("force", lane.precision)
+    others = {
+        name: Seen(data.get(name, seen.data), precision.get(name, seen.precision))
+        for name, seen in lane.others.items()
+    }
+    return lane._replace(others=others, **own)
 
 
 def peaks(kinds: list[Observed]) -> Float[np.ndarray, " lanes"]:
@@ -171,8 +172,7 @@ def data_weight(lane: Lane, sigma: Any) -> Any:
 def without_data(lane: Lane, hidden: Any) -> Lane:
     """The lane, or lanes, with the trials `hidden` (of the shape of `s_c`) unobserved; numpy."""
     blind = {}
-    for _, name in FORCES + MARKERS:
-        if (precision := getattr(lane, name)) is not None:
-            over = hidden.reshape(*hidden.shape, *[1] * (precision.ndim - hidden.ndim))
-            blind[name] = np.where(over, 0, precision)
-    return lane._replace(**blind)
+    for kind in forces(lane) + markers(lane):
+        over = hidden.reshape(*hidden.shape, *[1] * (kind.precision.ndim - hidden.ndim))
+        blind[kind.name] = np.where(over, 0, kind.precision)
+    return with_observed(lane, precision=blind)

@@ -5,6 +5,7 @@ program fits any number of them at once.
 """
 
 import dataclasses
+import functools
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
@@ -13,9 +14,10 @@ from jaxtyping import Float
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea._errors import InputError
-from jaxtrachea.fitting.lane import FORCES, MARKERS, Lane
+from jaxtrachea.fitting.lane import Lane, Seen, markers, with_observed
 from jaxtrachea.fitting.model import Loss
 from jaxtrachea.fitting.parameters import Parameter
+from jaxtrachea.measurements.observed import FITTED, Quantity
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.levels.level import Level
 from jaxtrachea.trachea.geometry import Geometry
@@ -177,9 +179,7 @@ class _Layout:
         trials: of a lane, at most.
         samples: of a curve, at most.
         unknowns: of a lane, at most.
-        joints: whether any curve has markers, or ring ends.
-        vectors: whether the model shows more than normal forces and motions on the midline.
-        time: whether it relaxes.
+        level: of the model.
         curves: all of them.
         lanes: how many.
     """
@@ -192,9 +192,7 @@ class _Layout:
     trials: int
     samples: int
     unknowns: int
-    joints: bool
-    vectors: bool
-    time: bool
+    level: Level
     curves: Sequence[Curve]
     lanes: int
 
@@ -221,11 +219,15 @@ def weighed_by_depth(lanes: Lane, noise: Noise, depth: Float[np.ndarray, "lanes 
     """The lanes with markers weighed by depths from first touch, mm, not by the records' zeros."""
     recorded = noise.joints_precision(np.asarray(lanes.displacement))
     ratio = noise.joints_precision(depth) / recorded
-    changed = {}
-    for _, name in MARKERS:
-        if (weight := getattr(lanes, name)) is not None:
-            changed[name] = weight * ratio.reshape(*ratio.shape, *[1] * (weight.ndim - ratio.ndim))
-    return lanes._replace(**changed)
+    changed = {
+        kind.name: kind.precision * _spread(ratio, kind.precision.ndim) for kind in markers(lanes)
+    }
+    return with_observed(lanes, precision=changed)
+
+
+def _spread(values: np.ndarray, ndim: int) -> np.ndarray:
+    """The values with so many axes in all, for all that a sample has."""
+    return values.reshape(*values.shape, *[1] * (ndim - values.ndim))
 
 
 def lanes_of(
@@ -249,9 +251,8 @@ def lanes_of(
         noise: known standard deviations.
         weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
         tool_radius: see `build.build_study`.
-        level: of the model: whether it reads what is below `Lane.phi_c`, and the time.
+        level: of the model: what it observes, and whether it reads angles and the time.
     """
-    vectors = level.off_midline
     every = [c for curves in groups for c in curves]
     lengths = [len(c.force) for c in every]
     layout = _Layout(
@@ -263,32 +264,29 @@ def lanes_of(
         trials=max(map(len, groups)),
         samples=max(lengths),
         unknowns=max(map(len, unknowns)),
-        joints=any(_has_motion(c, vectors=vectors) for c in every),
-        vectors=vectors,
-        time=level.relaxes,
+        level=level,
         curves=every,
         lanes=len(groups),
     )
     whole = _blank(layout)
     for k, (curves, names) in enumerate(zip(groups, unknowns, strict=True)):
         _fill({n: v if v is None else v[k] for n, v in whole.items()}, layout, curves, names)
+    others = _others(layout, groups, whole["precision"])
     first = whole["precision"].flat[0]
     if (whole["precision"] == first).all():  # one number for all takes no room
         whole["precision"] = np.broadcast_to(first, whole["precision"].shape)
-    return Lane(**whole)
+    return Lane(others=others, **whole)
 
 
 def _blank(layout: _Layout) -> dict[str, Any]:
     """Padded float64 arrays of all lanes, without their curves."""
     L, T, N, P = layout.lanes, layout.trials, layout.samples, layout.unknowns
-    parameters, rings = layout.parameters, layout.geometry.rings
+    parameters = layout.parameters
     out: dict[str, Any] = {
         "s_c": np.full((L, T), float(layout.geometry.length) / 2),
         "displacement": np.zeros((L, T, N)),
         "force": np.zeros((L, T, N)),
         "precision": np.zeros((L, T, N)),
-        "joints": np.zeros((L, T, N, rings)) if layout.joints else None,
-        "joint_precision": np.zeros((L, T, N, rings)) if layout.joints else None,
         "balance": np.ones((L, T)),
         "blend": None,
         "value": np.tile(np.array([p.value for p in parameters], np.float64), (L, T, 1)),
@@ -297,9 +295,9 @@ def _blank(layout: _Layout) -> dict[str, Any]:
         "upper": np.zeros((L, P)),
         "active": np.zeros((L, P)),
     }
-    if layout.vectors:
-        out |= _blank_vectors(layout)
-    if layout.time:
+    if layout.level.off_midline and any(off_midline(c) for c in layout.curves):
+        out |= {"phi_c": np.zeros((L, T)), "direction": np.tile([1.0, 0.0], (L, T, 1))}
+    if layout.level.relaxes:
         out |= {"time": np.zeros((L, T, N)), "rising": np.zeros((L, T, N))}
     return out
 
@@ -308,7 +306,7 @@ def _fill(
     lane: dict[str, Any], layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown]
 ) -> None:
     """Put the curves and unknowns of one lane into its arrays."""
-    parameters, geometry, noise = layout.parameters, layout.geometry, layout.noise
+    parameters, noise = layout.parameters, layout.noise
     place = {key: i for i, key in enumerate(unknowns)}
     for i, (p, _, _) in enumerate(unknowns):
         lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
@@ -318,7 +316,7 @@ def _fill(
         if curve.s_c is not None:
             lane["s_c"][t] = curve.s_c
         lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
-        if layout.time and curve.time is not None:
+        if layout.level.relaxes and curve.time is not None:
             lane["time"][t] = curve.time[-1] - curve.time[0]
             lane["time"][t, :n] = curve.time - curve.time[0]
             lane["rising"][t, slice(*(curve.rise or (0, n)))] = 1
@@ -327,47 +325,62 @@ def _fill(
         for j, p in enumerate(parameters):
             if not p.fixed:
                 lane["index"][t, j] = place.get(_key(p, curve), -1)
-        if curve.joint_displacement is not None and curve.joint_rings is not None:
-            weight = noise.joints_precision(curve.displacement)[:, None]
-            seen, at = _seen_joints(curve, geometry, layout.reach), curve.joint_rings
-            lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
-            lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
-        if layout.vectors:
-            _add_vectors(lane, layout, t, curve)
+        if lane.get("phi_c") is not None:
+            lane["phi_c"][t], lane["direction"][t] = curve.phi_c, curve.direction
 
 
-def has_ends(curve: Curve) -> bool:
-    """Whether the motion of ring ends is given."""
-    given = curve.end_U is not None or curve.end_V is not None
-    return curve.end_rings is not None and given
+def _others(
+    layout: _Layout, groups: Sequence[Sequence[Curve]], precision: np.ndarray
+) -> dict[str, Seen]:
+    """What curves have beside the force, by field of `Response`; `precision`: of the forces."""
+    room, rings = (layout.lanes, layout.trials, layout.samples), layout.geometry.rings
+    level, x, out = layout.level, np.asarray(layout.geometry.ring_positions), {}
+    for name, parts in FITTED.items():
+        if name in level.observes and any(_given(c, q) for c in layout.curves for q in parts):
+            out[name] = Seen(*(np.zeros((*room, *sample_shape(name, rings))) for _ in Seen._fields))
+    if any(FITTED[name][0].rings for name in out):  # where there are ends alone, without markers
+        out.setdefault("joints", Seen(*(np.zeros((*room, rings)) for _ in Seen._fields)))
+    for k, t, curve in ((k, t, c) for k, lane in enumerate(groups) for t, c in enumerate(lane)):
+        at = k, t, slice(len(curve.force))
+        for name, seen in out.items():
+            parts = FITTED[name]
+            # By symmetry the model knows nothing but 0 of a normal press on the midline.
+            if parts[0].odd and not off_midline(curve):
+                continue
+            values = measured(curve, name, rings)
+            known, weight = np.isfinite(values), precision[at]
+            if parts[0].rings is not None:
+                weight = layout.noise.joints_precision(curve.displacement)
+                far = [_away(x, curve, layout, q) for q in parts]
+                far = np.stack(far, axis=1) if len(parts) > 1 else far[0]
+                known &= _spread(far, values.ndim - 1)
+            seen.data[at] = np.where(known, values, 0)
+            seen.precision[at] = np.where(known, _spread(weight, values.ndim), 0)
+    return out
 
 
-def _has_motion(curve: Curve, *, vectors: bool) -> bool:
-    """Whether a curve has markers, or ring ends where the model reads them."""
-    more = curve.joint_side_displacement is not None or has_ends(curve)
-    return curve.joint_displacement is not None or (vectors and more)
+def _given(curve: Curve, q: Quantity) -> bool:
+    """Whether a curve has a quantity."""
+    there = getattr(curve, q.name) is not None
+    return there and (q.rings is None or getattr(curve, q.rings) is not None)
 
 
-def _blank_vectors(layout: _Layout) -> dict[str, Any]:
-    """Arrays of what is off the midline or not along the normal; None where no curve has it."""
-    samples = layout.lanes, layout.trials, layout.samples
-    rings, curves = layout.geometry.rings, layout.curves
-    shapes = {
-        "side_force": (any(c.side_force is not None for c in curves), samples),
-        "joint_side": (
-            any(c.joint_side_displacement is not None for c in curves), (*samples, rings),
-        ),
-        "ends": (any(map(has_ends, curves)), (*samples, rings, 2, 2)),
-    }  # fmt: skip
-    precision_of = dict(FORCES + MARKERS)
-    out: dict[str, Any] = {}
-    for name, (there, shape) in shapes.items():
-        out[name] = np.zeros(shape) if there else None
-        out[precision_of[name]] = np.zeros(shape) if there else None
-    out |= {"phi_c": None, "direction": None}
-    if any(off_midline(c) for c in curves):
-        L, T, _ = samples
-        out |= {"phi_c": np.zeros((L, T)), "direction": np.tile([1.0, 0.0], (L, T, 1))}
+@functools.cache
+def sample_shape(name: str, rings: int) -> tuple[int, ...]:
+    """Shape of a sample of a field of `Response`: rings, quantities of several, components."""
+    first, *more = FITTED[name]
+    shape = first.shape(0, rings)[1:]
+    return (*shape[:1], 1 + len(more), *shape[1:]) if more else shape
+
+
+def measured(curve: Curve, name: str, rings: int) -> np.ndarray:
+    """What a curve has of a field of `Response`, NaN where nothing; (N, sample)."""
+    out = np.full((len(curve.force), *sample_shape(name, rings)), np.nan)
+    for k, q in enumerate(FITTED[name]):
+        if _given(curve, q):
+            part = out[:, :, k] if len(FITTED[name]) > 1 else out
+            at = ... if q.rings is None else np.s_[:, getattr(curve, q.rings)]
+            part[at] = getattr(curve, q.name)
     return out
 
 
@@ -376,46 +389,12 @@ def off_midline(curve: Curve) -> bool:
     return curve.phi_c != 0 or tuple(curve.direction) != (1.0, 0.0)
 
 
-def _add_vectors(lane: dict[str, Any], layout: _Layout, t: int, curve: Curve) -> None:
-    """Put what a curve has of vectors into the arrays of its lane."""
-    n, geometry = len(curve.force), layout.geometry
-    if lane["phi_c"] is not None:
-        lane["phi_c"][t], lane["direction"][t] = curve.phi_c, curve.direction
-    # By symmetry the model knows nothing but 0 of a normal press on the midline.
-    aside = off_midline(curve)
-    if aside and curve.side_force is not None:
-        seen = np.isfinite(curve.side_force)
-        lane["side_force"][t, :n] = np.where(seen, curve.side_force, 0)
-        lane["side_precision"][t, :n] = np.where(seen, lane["precision"][t, :n], 0)
-    weight = layout.noise.joints_precision(curve.displacement)[:, None]
-    moved = curve.joint_side_displacement
-    if aside and moved is not None and curve.joint_rings is not None:
-        seen = np.isfinite(moved) & _away(curve, geometry, layout.reach, curve.joint_rings)
-        lane["joint_side"][t, :n, curve.joint_rings] = np.where(seen, moved, 0).T
-        lane["joint_side_precision"][t, :n, curve.joint_rings] = np.where(seen, weight, 0).T
-    if curve.end_rings is None:
-        return
-    for k, (end, side) in enumerate(((curve.end_U, -1.0), (curve.end_V, 1.0))):
-        if end is None:
-            continue
-        around = abs(side * float(geometry.half_angle) - curve.phi_c) * float(geometry.radius)
-        around = around if layout.pressed_ends else 0.0
-        far = _away(curve, geometry, layout.reach, curve.end_rings, around)
-        for ring, which, moved in zip(curve.end_rings, far, np.moveaxis(end, 1, 0), strict=True):
-            seen = np.isfinite(moved) & which
-            lane["ends"][t, :n, ring, k] = np.where(seen, moved, 0)
-            lane["end_precision"][t, :n, ring, k] = np.where(seen, weight, 0)
-
-
-def _away(curve: Curve, geometry: Geometry, reach: float, rings, around: float = 0.0) -> np.ndarray:
-    """Which of some rings lie beyond the tool, at a distance along the circumference; (M,)."""
-    x = np.asarray(geometry.ring_positions)[rings]
+def _away(x: np.ndarray, curve: Curve, layout: _Layout, q: Quantity) -> np.ndarray:
+    """Which rings at `x` lie beyond the tool, their ends also along the circumference; (rings,)."""
+    tube, around = layout.geometry, 0.0
     if curve.s_c is None:
         return np.ones(len(x), bool)
-    return np.hypot(x - curve.s_c, around) > reach
-
-
-def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
-    """Which markers of a curve count: observed, and not under the tool; (N, M)."""
-    seen = np.isfinite(np.asarray(curve.joint_displacement))
-    return seen & _away(curve, geometry, reach, curve.joint_rings)
+    if q.end and layout.pressed_ends:
+        side = {"U": -1.0, "V": 1.0}[q.end]
+        around = abs(side * float(tube.half_angle) - curve.phi_c) * float(tube.radius)
+    return np.hypot(x - curve.s_c, around) > layout.reach

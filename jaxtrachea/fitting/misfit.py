@@ -80,7 +80,7 @@ def _against_noise(of: Residuals, kinds: list[Observed]):
     study, lanes = of.study, of.study.lanes
     sizes = []
     for kind in kinds:
-        residual = getattr(of.seen, kind.name)
+        residual = of.seen[kind.name]
         known = np.isfinite(residual) & (kind.precision > 0)
         z = np.where(known, residual * kind.precision, np.nan)
         sizes.append(np.abs(z).reshape(len(of.samples), -1))

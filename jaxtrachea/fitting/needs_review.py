@@ -134,8 +134,9 @@ def barely_determined(study: Study) -> Bool[np.ndarray, " lanes"]:
     one more nearly the same, each a sharp minimum of its own.
     """
     count = np.sum(study.of_unknowns(lambda p: p.name in SKELETON, False), axis=1)
-    marked = study.lanes.joint_precision
-    seen = np.zeros(len(count), bool) if marked is None else (marked > 0).any(axis=(1, 2, 3))
+    marked = study.lanes.others.get("joints")
+    none = np.zeros(len(count), bool)
+    seen = none if marked is None else (marked.precision > 0).any(axis=(1, 2, 3))
     return (positions(study) <= count + 1) & (count > 1) & ~seen
 
 

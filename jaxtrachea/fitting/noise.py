@@ -12,7 +12,7 @@ from jaxtrachea.fitting.study import Study
 
 def noise_rounds(study: Study) -> int:
     """Re-weightings: needed where an estimated sigma changes the estimate, not only its error."""
-    both = study.lanes.joints is not None
+    both = bool(markers(study.lanes))
     return 4 if not study.noise_known.all() and (both or study.model.loss != "linear") else 0
 
 
@@ -37,7 +37,7 @@ def first_sigma(study: Study) -> np.ndarray:
     else:
         force = 0.02 * peak(forces(lanes))
     joints = np.ones(len(lanes.s_c))
-    if lanes.joints is not None and not study.noise_given[1]:
+    if markers(lanes) and not study.noise_given[1]:
         joints = 0.02 * peak(markers(lanes))
     return np.stack([force, joints], axis=1)
 
@@ -82,7 +82,7 @@ def precision_unit(study: Study) -> np.ndarray:
         flat = np.concatenate([v.precision.reshape(len(v.data), -1) for v in kinds], axis=1)
         return np.array([1 / np.median(row[row > 0]) if np.any(row > 0) else 1.0 for row in flat])
 
-    lanes, (force, joints) = study.lanes, study.noise_given
+    pressed, (force, joints) = forces(study.lanes), study.noise_given
     if study.shares is not None:
-        lanes = lanes._replace(precision=study.shares.plain, side_force=None)
-    return np.stack([typical(forces(lanes), force), typical(markers(lanes), joints)], 1)
+        pressed = [pressed[0]._replace(precision=study.shares.plain)]
+    return np.stack([typical(pressed, force), typical(markers(study.lanes), joints)], 1)

@@ -72,7 +72,7 @@ def _compliance(result: FitResult, lanes, theta) -> Float[np.ndarray, "n points 
     study = result.study
     count, points, size = theta.shape
     bare = without_curves(study)
-    read = bare.lanes._replace(joints=None, joint_precision=None)  # their motion is not asked for
+    read = bare.lanes._replace(others={})  # their motion is not asked for
     bare = dataclasses.replace(bare, lanes=read)
     # Of few points too: one program.
     batch = batch_size(TWIN_POINTS**2, max_in_cache(bare.bytes_per_lane))

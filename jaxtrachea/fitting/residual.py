@@ -194,7 +194,7 @@ class _Places(NamedTuple):
 
 
 def _places(lane: Lane) -> _Places:
-    return _Places(lane.s_c, lane.value, lane.joints is not None)
+    return _Places(lane.s_c, lane.value, "joints" in lane.others)
 
 
 def _skeleton(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleton:
@@ -258,15 +258,16 @@ def _times(load: Float[Array, " N"], joints: Float[Array, " rings"]) -> Float[Ar
 
 def _whitened(force, joints, trial: Lane) -> Float[Array, " m"]:
     """Difference to the data of one trial over its standard deviation, forces then markers."""
-    return _masked(force - trial.force, None if joints is None else joints - trial.joints, trial)
+    moved = None if joints is None else joints - trial.others["joints"].data
+    return _masked(force - trial.force, moved, trial)
 
 
 def _masked(force, joints, trial: Lane) -> Float[Array, " m"]:
     """Observed entries over their standard deviation, exact zeros elsewhere; in one row."""
     r = weighted(force, trial.precision)
-    if joints is None or trial.joint_precision is None:
+    if joints is None or "joints" not in trial.others:
         return r
-    markers = weighted(joints, trial.joint_precision)
+    markers = weighted(joints, trial.others["joints"].precision)
     return jnp.concatenate([r, markers.reshape(*r.shape[:-1], -1)], axis=-1)
 
 
@@ -397,40 +398,31 @@ def force_jacobian(
     model: FitModel,
     free: Float[Array, " Jf"],
     value: Float[Array, " J"],
-    s_c: Float[Array, ""],
-    displacement: Float[Array, " N"],
-    blend: Float[Array, ""] | None = None,
-    phi_c: Float[Array, ""] | None = None,
-    time: Float[Array, " N"] | None = None,
+    motion: Motion,
+    names: tuple[str, ...] = (),
 ) -> Float[Array, "Jf m"]:
     """Derivative of the force at the load cell by the free columns, of a press without data.
 
-    Shape (Jf, N); where `phi_c` is given the side force follows, (Jf, 2 N).
+    Shape (Jf, N); where the motion has an angle, after it those of `names`.
 
     Args:
         model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
-        s_c: mm.
-        displacement: of the tool, mm.
-        blend: rounded corner at the onset, mm, see `Lane`.
-        phi_c: contact angle, rad, the tool along the normal; None: on the midline.
-        time: of every displacement, s, where the force relaxes.
+        motion: of the tool; its onset is that of the parameters.
+        names: numbers of a `Response` that are observed beside the force.
     """
     tube = _tube(model, None, free.dtype)
-    motion = Motion(s_c, displacement, blend=blend, time=time)
     if model.level.forward:
-        if phi_c is not None:
-            along = jnp.asarray([1.0, 0.0], free.dtype)
-            motion = motion._replace(phi_c=phi_c, direction=along)
-        return forward_residual.force_jacobian(model, free, value, motion, tube)
-    places = _Places(s_c[None], value[None], marked=False)
+        names = () if motion.phi_c is None else names
+        return forward_residual.force_jacobian(model, free, value, motion, tube, names)
+    places = _Places(motion.s_c[None], value[None], marked=False)
     of_lane = _skeleton_and_derivative(model, free[None], places, tube)
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
     pressed = _press(model, tube, free, value, skeleton, by_beam, motion)
     if model.relaxes:
-        assert time is not None
-        pressed = relaxed_press(model, free, value, time, pressed)
+        assert motion.time is not None
+        pressed = relaxed_press(model, free, value, motion.time, pressed)
     return pressed.d_force + pressed.d_offset
 
 

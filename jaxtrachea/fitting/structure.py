@@ -92,8 +92,8 @@ def suspicious(study: Study) -> Bool[np.ndarray, " lanes"]:
         return np.zeros(len(lanes.s_c), bool)
     beam = sum(p.name in SKELETON for p in study.free)
     places = positions(study)
-    if lanes.joint_precision is not None:
-        marked = (lanes.joint_precision > 0).any(axis=2).sum(axis=2)
+    if "joints" in lanes.others:
+        marked = (lanes.others["joints"].precision > 0).any(axis=2).sum(axis=2)
         places = places + marked.max(axis=1)
     names = {p.name for p in study.free}
     needed = beam
@@ -243,8 +243,8 @@ def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     n = V.shape[1]
     of_curve = np.einsum("vn,ltnp->ltvp", V, J[:, :, :n])
     motion = J[:, :, n:]
-    if study.lanes.joint_precision is not None:
-        visible = (study.lanes.joint_precision[lanes] > 0).any(axis=2)
+    if "joints" in study.lanes.others:
+        visible = (study.lanes.others["joints"].precision[lanes] > 0).any(axis=2)
         motion = motion * visible[..., None]
     observed = (study.lanes.precision[lanes] > 0).any(axis=2)
     J = np.concatenate([of_curve, motion], axis=2) * observed[:, :, None, None]
@@ -375,11 +375,11 @@ def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes
     count = len(lanes.s_c)
     if study.joint or study.model.level.closed is None:
         return np.arange(count), np.arange(count)  # without a closed form every displacement counts
-    marked = lanes.joint_precision
+    marked = lanes.others.get("joints")
     parts = [lanes.s_c, lanes.index, lanes.value, lanes.active, lanes.lower, lanes.upper]
     parts.append((lanes.precision > 0).any(axis=2))
     if marked is not None:
-        parts.append((marked > 0).any(axis=2))
+        parts.append((marked.precision > 0).any(axis=2))
     table = np.concatenate([np.asarray(v, float).reshape(count, -1) for v in parts], axis=1)
     _, first, kind = np.unique(table, axis=0, return_index=True, return_inverse=True)
     return first, kind.reshape(-1)
@@ -400,9 +400,8 @@ def _log(study: Study) -> Bool[np.ndarray, "lanes P"]:
 def without_curves(study: Study) -> Study:
     """The study with curves of one sample: what the inputs need and no more."""
     lanes = study.lanes
-    one = {name: getattr(lanes, name)[:, :, :1] for name in ("displacement", "force", "precision")}
+    names = ("displacement", "force", "precision", "others")
+    one = jax.tree.map(lambda v: v[:, :, :1], {name: getattr(lanes, name) for name in names})
     if lanes.time is not None and lanes.rising is not None:
         one |= {"time": lanes.time[:, :, :1], "rising": lanes.rising[:, :, :1]}
-    if lanes.joints is not None:
-        one |= {name: getattr(lanes, name)[:, :, :1] for name in ("joints", "joint_precision")}
     return dataclasses.replace(study, lanes=lanes._replace(**one))

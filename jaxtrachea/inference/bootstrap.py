@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lane import Lane, Observed, forces, markers
+from jaxtrachea.fitting.lane import Lane, Observed, forces, markers, with_observed
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
@@ -169,10 +169,10 @@ def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) 
         rng = np.random.default_rng([seed, int(lane)])
         noise = draw(rng, result, seen, lane, count, block)
         for channel in channels:
-            model = channel.data[lane] + np.nan_to_num(getattr(seen, channel.name)[lane])
+            model = channel.data[lane] + np.nan_to_num(seen[channel.name][lane])
             found[channel.name].append(model + noise[channel.name])
     sampled = result.study.take(lanes.repeat(count)).lanes
-    return sampled._replace(**{name: np.concatenate(parts) for name, parts in found.items()})
+    return with_observed(sampled, {name: np.concatenate(parts) for name, parts in found.items()})
 
 
 def _kinds(result: FitResult) -> list[tuple[Observed, int]]:
@@ -205,7 +205,7 @@ def _blocks(rng, result: FitResult, seen: Prediction, lane, count, block):
         starts = rng.integers(n, size=(count, -(-n // block)))
         at = ((starts[:, :, None] + np.arange(block)) % n).reshape(count, -1)[:, :n]
         for kind, _ in kinds:
-            r, precision = getattr(seen, kind.name)[lane, t, :n], kind.precision[lane, t, :n]
+            r, precision = seen[kind.name][lane, t, :n], kind.precision[lane, t, :n]
             own = enlarge * enlargement(n, block)
             noise[kind.name][:, t, :n] = own * _resample(r, precision, at)
     return noise

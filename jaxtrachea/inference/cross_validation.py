@@ -127,7 +127,7 @@ def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOu
     for row, (k, t) in enumerate(zip(lane, trial, strict=True)):
         held[row, companions(study.curves[k], study.holdout_groups)[t]] = True
     result, touched, seen = refitted(chosen, held, whole.theta[lane], settings, progress)
-    force, data = seen.force[rows, trial], lanes.force[rows, trial]
+    force, data = seen["force"][rows, trial], lanes.force[rows, trial]
     observed = lanes.precision[rows, trial] > 0
     lost = np.any(observed & ~np.isfinite(force), axis=1)
     model = np.where(observed, data + force, 0)
@@ -135,11 +135,11 @@ def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOu
         ratio = np.sum(data * model, axis=1) / np.sum(model * model, axis=1) - 1
         peak = np.asarray(rms(force)) / np.max(np.abs(data), axis=1)
     joints = np.full(len(lane), np.nan)
-    if seen.joints is not None:
+    if "joints" in seen:
         D = lanes.displacement[rows, trial] - whole.first_touch[lane, trial][:, None]
         D = np.where(observed, np.abs(D), 0)
         moved = D > 0.5 * np.max(D, axis=1, keepdims=True)
-        share = seen.joints[rows, trial] / np.where(moved, D, np.nan)[:, :, None]
+        share = seen["joints"][rows, trial] / np.where(moved, D, np.nan)[:, :, None]
         joints = np.asarray(rms(share.reshape(len(lane), -1)))
     return LeftOut(
         lane=lane,

@@ -20,7 +20,6 @@ from jaxtrachea.fitting.gauss_newton import GaussNewton
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.misfit import Residuals
 from jaxtrachea.fitting.needs_review import local_doubt
-from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.refusals import Size, check_curve, refusal
 from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.fitting.starts import scales
@@ -239,7 +238,7 @@ class Online:
         minimum, stream, (sweeps, before) = self._minimum, self._minimum.stream, self._counted
         # Residuals are those of the point; a tenth more samples may be correlated otherwise.
         if stream.sweeps != sweeps or count[0] > 1.1 * before:
-            residual, solved = Prediction(stream.residual, None), np.ones(1, bool)
+            residual, solved = {"force": stream.residual}, np.ones(1, bool)
             seen = Residuals(stream.study, residual, count, minimum.at_bound, solved)
             self._worth = effective(seen, errors.half_width)
             self._counted = stream.sweeps, int(count[0])

@@ -232,7 +232,7 @@ def posterior(
     result.study.refuse_sections("the posterior")
     sampler()
     study, base = result.study, mode(result)
-    markers = study.lanes.joints is not None
+    markers = "joints" in study.lanes.others
     noise_sampled = (not study.noise_given[0], markers and not study.noise_given[1])
     good = np.array([k for k in range(result.lanes) if succeeded(result, k)], int)
     found = _empty(result, chains, draws)

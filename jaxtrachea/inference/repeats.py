@@ -232,7 +232,7 @@ def leave_repeats_out(
         return Missed(np.full(count, np.nan), none, none, none)
     chosen = study.take(lanes)
     result, touched, seen = refitted(chosen, held, whole.theta[lanes], settings, progress)
-    seen = seen.force
+    seen = seen["force"]
     predicted = scored.reshape(*scored.shape[:2], -1)
     observed = predicted & (chosen.lanes.precision > 0)
     lost = np.any(observed & ~np.isfinite(seen), axis=(1, 2))

@@ -15,11 +15,11 @@ def rms(values: np.ndarray) -> np.ndarray | np.floating:
 
 def worst(prediction: Prediction, result: FitResult) -> str:
     """The largest force residual in words."""
-    largest = [np.max(np.abs(r), where=np.isfinite(r), initial=-1) for r in prediction.force]
+    largest = [np.max(np.abs(r), where=np.isfinite(r), initial=-1) for r in prediction["force"]]
     lane = int(np.argmax(largest))
     if largest[lane] < 0:
         return "none, no finite prediction"
-    force = prediction.force[lane]
+    force = prediction["force"][lane]
     trial, sample = np.argwhere(np.abs(force) == largest[lane])[0]
     curve, value = result.study.curves[lane][trial], force[trial, sample]
     return (
@@ -37,7 +37,7 @@ def where_missed(result: FitResult, lane: int) -> str:
 
     The stretch is the one of residuals of one sign with the largest sum.
     """
-    residual, curves = result.residuals.force[lane], result.study.curves[lane]
+    residual, curves = result.residuals["force"][lane], result.study.curves[lane]
     curve, row = max(zip(curves, residual, strict=False), key=lambda pair: float(rms(pair[1])))
     known = np.flatnonzero(np.isfinite(row))
     order = known

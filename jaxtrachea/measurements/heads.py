@@ -122,7 +122,7 @@ def _with_roles(found: str, header: Header, options: ReadOptions) -> Head:
     names, units = header.names, header.units
     roles, ambiguous = {}, ""
     try:
-        roles = find_roles(names, options)
+        roles = find_roles(names, options, units)
         if "time" not in roles and (time := time_column(names, units, roles, options)):
             roles["time"] = time[0]
     except Fault as fault:

@@ -29,6 +29,8 @@ class Quantity:
         turns: `ReadOptions.force_sign` turns it.
         largest: option of `ReadOptions` that bounds its size; None: it is not bounded.
         vector: only a model of presses in any direction reads it.
+        fitted: field of a level's `Response` that a fit compares it with, alone or with others.
+        odd: by symmetry 0 of a press along the normal on the midline, where no fit reads it.
     """
 
     name: str
@@ -46,6 +48,13 @@ class Quantity:
     turns: bool = False
     largest: str | None = None
     vector: bool = False
+    fitted: str = ""
+    odd: bool = False
+
+    @property
+    def short(self) -> str:
+        """Begin of the names of what results have of it: "side" of `side_force`."""
+        return self.role.removesuffix("_force") + self.side
 
     def columns(self, ring: int | str) -> list[str]:
         """Roles of the columns of a ring (counted from 1), one for each component."""
@@ -67,7 +76,7 @@ _MARKERS: dict[str, Any] = {
 }
 _ENDS: dict[str, Any] = {
     "role": "end", "dimension": "length", "unit": "mm", "rings": "end_rings",
-    "components": ("y", "z"), "largest": "max_displacement", "vector": True,
+    "components": ("y", "z"), "largest": "max_displacement", "vector": True, "fitted": "ends",
 }  # fmt: skip
 
 OBSERVED = (
@@ -79,12 +88,14 @@ OBSERVED = (
     Quantity(
         "side_force", "side_force", "force", "N", "side force",
         names=("side force",), turns=True, largest="max_force", vector=True,
+        fitted="side_force", odd=True,
     ),
     # The size of the inward part of markers has never been bounded.
-    Quantity("joint_displacement", words="motion of markers", **_MARKERS),
+    Quantity("joint_displacement", words="motion of markers", fitted="joints", **_MARKERS),
     Quantity(
         "joint_side_displacement", words="sideward motion of markers", side="_side",
-        requires="joint_displacement", largest="max_displacement", vector=True, **_MARKERS,
+        requires="joint_displacement", largest="max_displacement", vector=True,
+        fitted="joint_side", odd=True, **_MARKERS,
     ),
     Quantity("end_U", words="motion of ring ends U", end="U", **_ENDS),
     Quantity("end_V", words="motion of ring ends V", end="V", **_ENDS),
@@ -95,6 +106,15 @@ RINGS = {
     field: tuple(q for q in OBSERVED if q.rings == field)
     for field in dict.fromkeys(q.rings for q in OBSERVED if q.rings is not None)
 }
+#: What a fit compares with a level's `Response`, by its field, in the order of the residual's row.
+FITTED = {
+    field: tuple(q for q in OBSERVED if q.fitted == field)
+    for field in dict.fromkeys(q.fitted for q in OBSERVED if q.fitted)
+}
+# There are two noises: that of the force, and that of markers.
+assert all(q.dimension == ("length" if q.rings else "force") for p in FITTED.values() for q in p)
+#: Those of one number for every sample.
+FITTED_NUMBERS = {name: parts[0] for name, parts in FITTED.items() if parts[0].rings is None}
 #: Datasets and messages number rings from 1, under names of their own.
 RING_NUMBERS = {"joint_rings": "joint_ring_number", "end_rings": "end_ring_number"}
 #: Fields of a curve that one of displacement, force, noise and time does not have.

@@ -215,8 +215,7 @@ def _on_cone(sliding, D, compliance, law: Law, mu) -> _OnCone:
     def safe(value, other):
         return jnp.where(solved, value, jnp.asarray(other, D.dtype))
 
-    one, none = jnp.ones_like(law.k_1), jnp.zeros_like(law.k_1)
-    linear = Law(one, none, None if law.k_5 is None else none)
+    linear = jax.tree.map(jnp.zeros_like, law)._replace(k_1=jnp.ones_like(law.k_1))
     used = safe(D, 1), safe(compliance, 0), jax.tree.map(safe, law, linear), mu
     z = _follow(safe(z, 2**0.5), *used)  # of unit motions on a law of 1 N/mm alone
     force, depth, _ = _at_root(z, *used)

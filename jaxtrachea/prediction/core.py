@@ -4,7 +4,7 @@ Standard errors by the delta method: covariance of the estimates through the exa
 cannot do is said in `prediction.predict`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,32 +16,16 @@ from jaxtrachea.fitting.forward_residual import answer
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.mechanics.levels.level import Motion
 
-
-class Response(NamedTuple):
-    """The model's answer at one contact position; N displacements.
-
-    Attributes:
-        force: at the load cell, with its offset, N; (N,).
-        joints: deflection of the ligament at each ring, mm; of cross-sections that of the outer
-            surface at the contact's angle, along the inward normal; (N, rings).
-        reactions: force of each ring against the load, N; (N, rings). None of deforming
-            cross-sections, whose rings stand on a bed.
-        side_force: of deforming cross-sections, N, see `Curve`; (N,).
-        joint_side: of those, along the circumference, mm; (N, rings).
-    """
-
-    force: Float[Array, "*n"]
-    joints: Float[Array, "*n rings"]
-    reactions: Float[Array, "*n rings"] | None
-    side_force: Float[Array, "*n"] | None = None
-    joint_side: Float[Array, "*n rings"] | None = None
+#: What is predicted of a `levels.level.Response`, by its field, the force at the load cell; an axis
+#: of displacements first. What the level does not have, and the motion of ring ends, is not there.
+Values = dict[str, Any]
 
 
 class Predicted(NamedTuple):
     """A response with standard errors from the parameters alone; inf where undetermined.
 
     Attributes:
-        value: the response.
+        value: what is predicted.
         se: its standard errors.
         status: `PressStatus` of every displacement; (N,).
         bend: how far the force leaves its tangent where the parameters move to either end of the
@@ -49,8 +33,8 @@ class Predicted(NamedTuple):
         deepest: index of that displacement.
     """
 
-    value: Response
-    se: Response
+    value: Values
+    se: Values
     status: Int[Array, "*n"]
     bend: Float[Array, "2 ..."]
     deepest: Int[Array, ""]
@@ -58,7 +42,7 @@ class Predicted(NamedTuple):
 
 def respond(
     model: FitModel, free: Float[Array, " F"], value: Float[Array, " J"], motion: Motion
-) -> tuple[Response, Int[Array, " N"]]:
+) -> tuple[Values, Int[Array, " N"]]:
     """The fitted model at one position: response and `PressStatus`; pure.
 
     Args:
@@ -70,7 +54,8 @@ def respond(
     """
     tube = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
     found = answer(model, free, value, motion, tube)
-    return Response(*(getattr(found, name) for name in Response._fields)), found.status
+    values = found._replace(ends=None)._asdict()
+    return {n: v for n, v in values.items() if n != "status" and v is not None}, found.status
 
 
 def jacobian(model: FitModel, free, value, motion: Motion):
@@ -123,18 +108,18 @@ def predicted(
     out, status, slopes = jacobian(model, free, value, motion)
     se = jax.tree.map(lambda slope: standard_errors(slope, covariance, null_space), slopes)
     if slack is not None:
-        unseen = _unseen(slopes.force, slack)
-        se = se._replace(force=standard_errors(slopes.force, covariance, null_space, unseen))
+        unseen = _unseen(slopes["force"], slack)
+        se["force"] = standard_errors(slopes["force"], covariance, null_space, unseen)
     deepest = jnp.argmax(jnp.abs(motion.displacement))
-    pull = covariance @ slopes.force[:, deepest]
-    along = jnp.sqrt(jnp.maximum(slopes.force[:, deepest] @ pull, 0))
+    pull = covariance @ slopes["force"][:, deepest]
+    along = jnp.sqrt(jnp.maximum(slopes["force"][:, deepest] @ pull, 0))
     known = (along > 0) & jnp.isfinite(half_width)
     step = jnp.where(known, half_width / jnp.where(along > 0, along, 1), 0) * pull
-    straight = jnp.einsum("f...,f->...", slopes.force, step)
+    straight = jnp.einsum("f...,f->...", slopes["force"], step)
 
     def bend(sign):
         end, _ = respond(model, free + sign * step, value, motion)
-        return end.force - out.force - sign * straight
+        return end["force"] - out["force"] - sign * straight
 
     if model.level.iterates:  # one program for both: it is long to compile
         bends = jax.vmap(bend)(jnp.asarray([1.0, -1.0], free.dtype))
@@ -146,4 +131,4 @@ def predicted(
 def force_and_slope(model: FitModel, free, value, motion: Motion):
     """Force of one curve and its derivative by the free columns; (N,) and (F, N)."""
     out, _, slopes = jacobian(model, free, value, motion)
-    return out.force, slopes.force
+    return out["force"], slopes["force"]

@@ -25,7 +25,7 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.prediction.core import Estimate, Predicted, Response, predicted
+from jaxtrachea.prediction.core import Estimate, Predicted, Values, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
 from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.prediction.sources import (
@@ -38,6 +38,8 @@ from jaxtrachea.status import PredictionStatus, PressStatus
 
 #: Parts of parameters that say nothing of a skeleton.
 AT_CONTACT = ("contact", "time", "press")
+#: What a prediction has fields of its own for.
+OWN = ("force", "joints", "reactions")
 #: Error of the linear band at its ends, in half-widths, from which it is called bent.
 BENT = 0.5
 
@@ -69,11 +71,8 @@ class CurvePrediction:
         press_status: `PressStatus`; (N,).
         phi: contact angle, rad.
         direction: of the tool along the inward normal and the circumference.
-        side_force: across the tool's direction, N, see `Curve`; (N,); None where the model has
-            none. Like the next three, of a skeleton of deforming cross-sections.
-        side_se: its standard error from the parameters.
-        joint_side: of each ring along the circumference, mm; (N, rings).
-        joint_side_se: from the parameters.
+        others: what the model has beside, by field of `levels.level.Response`: value, and standard
+            error from the parameters.
         model_se: standard deviation of the error of the model between the positions of the fit, N;
             (N,); 0 at one of them, and where too few tell it.
         model_quantile: of a 95 % interval in `model_se`.
@@ -98,10 +97,7 @@ class CurvePrediction:
     press_status: np.ndarray
     phi: float = 0.0
     direction: tuple[float, float] = (1.0, 0.0)
-    side_force: np.ndarray | None = None
-    side_se: np.ndarray | None = None
-    joint_side: np.ndarray | None = None
-    joint_side_se: np.ndarray | None = None
+    others: dict[str, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
     model_se: np.ndarray | float = 0.0
     model_quantile: float = 0.0
     time: np.ndarray | None = None
@@ -110,12 +106,6 @@ class CurvePrediction:
         """Half of a band with noise of a standard deviation, N; (N,)."""
         known = self.half_width * np.hypot(self.se, sigma)
         return np.hypot(known, self.model_quantile * self.model_se)
-
-    @property
-    def side_half(self) -> np.ndarray:
-        """Half of the band of a new sample of the side force, N; (N,)."""
-        se = np.full_like(self.force, np.nan) if self.side_se is None else self.side_se
-        return self.half_width * np.hypot(se, self.sigma)
 
     @property
     def has_skeleton(self) -> bool:
@@ -283,12 +273,12 @@ def _on_host(
     usable = source.status.predicts
 
     def hide(v) -> Any:
-        return v if usable or v is None else np.full_like(v, np.nan)
+        return v if usable else np.full_like(v, np.nan)
 
     skeleton = any(DECLARED[p.name].part not in AT_CONTACT for p in stored.study.parameters)
 
     def show(v) -> Any:
-        return hide(v) if skeleton and v is not None else np.full_like(value.joints, np.nan)
+        return hide(v) if skeleton and v is not None else np.full_like(value["joints"], np.nan)
 
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
@@ -299,24 +289,21 @@ def _on_host(
         trial=source.trial,
         s=float(s),
         displacement=np.asarray(displacement, np.float64),
-        force=hide(value.force),
-        se=hide(se.force),
+        force=hide(value["force"]),
+        se=hide(se["force"]),
         half_width=float(source.half_width),
         sigma=np.full(n, source.sigma[0]) if sigma is None else sigma,
-        joints=show(value.joints),
-        joints_se=show(se.joints),
-        reactions=show(value.reactions),
-        reactions_se=show(se.reactions),
+        joints=show(value["joints"]),
+        joints_se=show(se["joints"]),
+        reactions=show(value.get("reactions")),
+        reactions_se=show(se.get("reactions")),
         joint_sigma=_marker_sigma(stored, source, displacement),
         status=status,
         message="; ".join(filter(None, [message, *outside])),
         press_status=presses,
         phi=float(phi),
         direction=direction,
-        side_force=hide(value.side_force),
-        side_se=hide(se.side_force),
-        joint_side=hide(value.joint_side),
-        joint_side_se=hide(se.joint_side),
+        others={name: (hide(v), hide(se[name])) for name, v in value.items() if name not in OWN},
     )
 
 
@@ -352,14 +339,14 @@ def _marker_sigma(stored: FitResult, source: CurveParameters, displacement) -> n
 
 
 def _bend(
-    source: CurveParameters, off: np.ndarray, value: Response, se: Response, deepest: int
+    source: CurveParameters, off: np.ndarray, value: Values, se: Values, deepest: int
 ) -> float:
     """Error of the linear band at its ends, at the deepest displacement, in half-widths.
 
     What the curve's own parameters take up does not count: they are fitted to it.
     """
-    half = float(source.half_width * se.force[deepest])
-    if not (np.isfinite(half) and half > 0 and np.isfinite(value.force[deepest])):
+    half = float(source.half_width * se["force"][deepest])
+    if not (np.isfinite(half) and half > 0 and np.isfinite(value["force"][deepest])):
         return 0.0
     if source.refitted_own is not None:
         slope, gain = source.refitted_own
@@ -393,7 +380,7 @@ def _beyond(spans: np.ndarray, s: float, depth: np.ndarray, aside=(), counted: s
 
 
 def _verdict(
-    source: CurveParameters, value: Response, se: Response, presses, bend: float,
+    source: CurveParameters, value: Values, se: Values, presses, bend: float,
     foreign: Sequence[str] = (),
 ):  # fmt: skip
     """The worst that is to be said of a predicted curve, and everything in words.
@@ -402,14 +389,14 @@ def _verdict(
     """
     found = [(source.status, source.message)]
     if source.status.predicts:
-        lost = ~np.isfinite(value.force)
+        lost = ~np.isfinite(value["force"])
         if lost.any():
             word = PressStatus(int(presses[lost][0])).message
             found.append((PredictionStatus.NO_SOLUTION, f"{int(lost.sum())} samples: {word}"))
         if (deep := presses == PressStatus.TOO_DEEP).any():
             word = f"{int(deep.sum())} samples: {PressStatus.TOO_DEEP.message}"
             found.append((PredictionStatus.TOO_DEEP, word))
-        if np.isinf(se.force).any() or np.isinf(source.half_width):
+        if np.isinf(se["force"]).any() or np.isinf(source.half_width):
             found.append((PredictionStatus.UNDETERMINED, ""))
         if foreign:
             found.append((PredictionStatus.EXTRAPOLATED, f"fixed: {', '.join(foreign)}"))

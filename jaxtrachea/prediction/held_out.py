@@ -57,13 +57,10 @@ class Compared:
         """Predicted minus measured force, N; (N,)."""
         return self.prediction.force - self.curve.force
 
-    @property
-    def side_residual(self) -> np.ndarray:
-        """Predicted minus measured side force, N; NaN where there is none of both; (N,)."""
-        predicted, measured = self.prediction.side_force, self.curve.side_force
-        if predicted is None or measured is None:
-            return np.full(len(self.curve.force), np.nan)
-        return predicted - measured
+    def other_residual(self, name: str) -> np.ndarray:
+        """Predicted minus measured `name` of `FITTED_NUMBERS`; NaN where there is none; (N,)."""
+        predicted, measured = self.prediction.others[name][0], getattr(self.curve, name)
+        return np.full(len(predicted), np.nan) if measured is None else predicted - measured
 
     @property
     def with_force(self) -> np.ndarray:

@@ -4,7 +4,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaxtrachea.measurements.read import BadCurve
+from jaxtrachea.measurements.observed import FITTED_NUMBERS
+from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.prediction.curves import CurvePrediction
 from jaxtrachea.prediction.held_out import Compared
@@ -36,35 +37,34 @@ def _place(p: CurvePrediction, i: int) -> Row:
     return where | clock
 
 
-def prediction_rows(
-    p: CurvePrediction,
-    measured: np.ndarray | None = None,
-    side: np.ndarray | None = None,
-) -> Iterator[Row]:
+def prediction_rows(p: CurvePrediction, curve: Curve | None = None) -> Iterator[Row]:
     """One row per displacement; the band is that of a new sample.
 
     Args:
         p: the prediction.
-        measured: force, N; (N,).
-        side: measured side force, N; (N,).
+        curve: as measured, if it was.
     """
     low, high = p.low95, p.high95
     for i in range(len(p.displacement)):
-        force = np.nan if measured is None else float(measured[i])
+        force = np.nan if curve is None else float(curve.force[i])
         numbers = (force, float(p.force[i]), float(low[i]), float(high[i]))
         cells = dict(zip(COLUMNS[6:], map(_cell, numbers), strict=True))
-        yield _place(p, i) | cells | _side_cells(p, i, side)
+        yield _place(p, i) | cells | _other_cells(p, i, curve)
 
 
-def _side_cells(p: CurvePrediction, i: int, measured: np.ndarray | None) -> Row:
-    """Side force of a sample, where the model has one."""
-    if p.side_force is None:
-        return {}
-    force, half = float(p.side_force[i]), float(p.side_half[i])
-    seen = np.nan if measured is None else float(measured[i])
-    names = ("side force [N]", "predicted side [N]", "side low95 [N]", "side high95 [N]")
-    values = (seen, force, force - half, force + half)
-    return dict(zip(names, map(_cell, values), strict=True))
+def _other_cells(p: CurvePrediction, i: int, curve: Curve | None) -> Row:
+    """What the model has of a sample beside the force."""
+    cells: Row = {}
+    for name, q in FITTED_NUMBERS.items():
+        if name in p.others:
+            value, se = (float(v[i]) for v in p.others[name])
+            half = p.half_width * float(np.hypot(se, p.sigma[i]))
+            given = None if curve is None else getattr(curve, name)
+            seen, head = np.nan if given is None else float(given[i]), q.short
+            names = (q.words, f"predicted {head}", f"{head} low95", f"{head} high95")
+            numbers = (seen, value, value - half, value + half)
+            cells |= {f"{n} [{q.unit}]": _cell(v) for n, v in zip(names, numbers, strict=True)}
+    return cells
 
 
 def band_rows(p: CurvePrediction, at: Sequence[int] | None = None) -> Iterator[Row]:
@@ -190,19 +190,19 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
         "worst joint [mm]": _cell(off_most),
         "status": status.name.lower(),
         "message": first.prediction.message if one else status.message,
-    } | _side_errors(of, group)  # fmt: skip
+    } | _other_errors(of, group)  # fmt: skip
 
 
-def _side_errors(of: str, group: Sequence[Compared]) -> Row:
-    """Angle and error of the side force, where the model has one."""
-    if group[0].prediction.side_force is None:
-        return {}
-    off = np.concatenate([c.side_residual for c in group])
-    off = off[np.isfinite(off)]
+def _other_errors(of: str, group: Sequence[Compared]) -> Row:
+    """Angle, and errors of what the model has beside the force."""
     first = group[0].prediction
     phi, tilt = np.degrees([first.phi, tilt_of(first.direction)]).tolist()
-    return {
-        "phi [deg]": phi if of != "all" else None,
-        "tilt [deg]": tilt if of != "all" else None,
-        "rms side [N]": float(np.sqrt(np.mean(off**2))) if len(off) else None,
-    }
+    numbers = {name: q for name, q in FITTED_NUMBERS.items() if name in first.others}
+    angles = {"phi [deg]": phi, "tilt [deg]": tilt} if numbers else {}
+    cells: Row = {name: angle if of != "all" else None for name, angle in angles.items()}
+    for name, q in numbers.items():
+        off = np.concatenate([c.other_residual(name) for c in group])
+        off = off[np.isfinite(off)]
+        rms = float(np.sqrt(np.mean(off**2))) if len(off) else None
+        cells[f"rms {q.short} [{q.unit}]"] = rms
+    return cells

@@ -118,7 +118,7 @@ def _curve(found: Influence, shown: Shown, lane: int, t: int, unknowns: list[int
     result, of = found.result, found.of
     curve, n = result.study.curves[lane][t], len(result.study.curves[lane][t].force)
     at = np.unique(np.linspace(0, n - 1, min(n, POINTS)).round().astype(int))
-    fitted = curve.force + result.residuals.force[lane, t, :n]
+    fitted = curve.force + result.residuals["force"][lane, t, :n]
     columns = np.asarray(result.study.lanes.index)[lane, t, list(result.study.free_columns)]
     moves, reasons = [], []
     for i in unknowns:

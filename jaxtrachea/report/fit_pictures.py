@@ -8,6 +8,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxtrachea.files.pictures import plain
+from jaxtrachea.measurements.observed import FITTED_NUMBERS
 from jaxtrachea.report.captions import FEW
 from jaxtrachea.report.shown import GREY, Shown, along, position_signs
 from jaxtrachea.report.small_multiples import Cell, small_multiples
@@ -42,8 +43,9 @@ class Trace(NamedTuple):
 
 
 def draw_force(shown: Shown, name: str = "force"):
-    """Measured and fitted `force`, or `side_force`, of every panel above the residuals."""
+    """Measured and fitted `force`, or one of `FITTED_NUMBERS`, of every panel above residuals."""
     result, words = shown.result, []
+    unit = FITTED_NUMBERS[name].unit if name in FITTED_NUMBERS else "N"
 
     def trace(lane: int, t: int) -> Trace | None:
         curve = result.study.curves[lane][t]
@@ -59,7 +61,7 @@ def draw_force(shown: Shown, name: str = "force"):
         return Trace(x[order], *(v[order] for v in parts))
 
     traces = [[(t, trace(p.lane, t)) for t in p.trials] for p in shown.panels]
-    return _draw(shown, traces, words[0], f"{name.replace('_', ' ')} [N]")
+    return _draw(shown, traces, words[0], f"{name.replace('_', ' ')} [{unit}]")
 
 
 def draw_joints(shown: Shown):
@@ -68,7 +70,7 @@ def draw_joints(shown: Shown):
     The line is the fit where it was compared.
     """
     study = shown.result.study
-    precision = np.asarray(study.lanes.joint_precision)
+    precision = study.lanes.others["joints"].precision
     rings = np.asarray(study.model.geometry.ring_positions, float)
 
     def trace(lane: int, t: int) -> Trace | None:

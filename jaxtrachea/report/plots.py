@@ -15,6 +15,7 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
+from jaxtrachea.measurements.observed import FITTED_NUMBERS
 from jaxtrachea.report.captions import captions
 from jaxtrachea.report.fit_pictures import draw_force, draw_joints
 from jaxtrachea.report.shown import Shown, along, position_signs
@@ -43,11 +44,11 @@ def draw_all(
     drawings: dict[str, Any] = {
         "fit": partial(draw_force, shown),
         "joints": partial(draw_joints, shown),
-        "side_force": partial(draw_force, shown, "side_force"),
         "residuals": partial(draw_residuals, shown),
         "waterfall": partial(draw_waterfall, findings.result),
         "correlation": partial(draw_correlation, findings.result),
     }
+    drawings |= {name: partial(draw_force, shown, name) for name in FITTED_NUMBERS}
     mine = {f"{name}.png": drawings[name] for name in captions(findings.result)}
     return _save(folder, mine | _drawings(findings), ending)
 
@@ -89,7 +90,7 @@ def draw_residuals(shown: Shown):
         for t, curve in enumerate(result.study.curves[lane]):
             n = len(curve.force)
             peak = np.max(np.abs(curve.force))
-            r = 100 * prediction.force[lane, t, :n] / (peak if peak > 0 else 1)
+            r = 100 * prediction["force"][lane, t, :n] / (peak if peak > 0 else 1)
             x, head = along(curve)
             drawn = rng.random(n) < part if many and part < 1 else slice(None)
             pooled.append(r[drawn])

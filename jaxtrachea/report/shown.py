@@ -55,14 +55,14 @@ class Shown:
         at = self.lanes.index(lane), t, sample
         result = self.result
         half = result.uncertainty.half_width[lane] * result.effective.growth[lane]
-        fitted = getattr(self.errors.fitted, name)[at]
+        fitted = self.errors.fitted[name][at]
         band = np.where(np.isfinite(fitted), fitted, np.nan) * (
             half if np.isfinite(half) else np.nan
         )
         return (
-            getattr(result.residuals, name)[lane, t, sample],
+            result.residuals[name][lane, t, sample],
             band,
-            getattr(self.errors.studentised, name)[at],
+            self.errors.studentised[name][at],
         )
 
     @property

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxtrachea.fitting.lane import FORCES, MARKERS, Lane
+from jaxtrachea.fitting.lane import Lane, Seen
 from jaxtrachea.fitting.model import FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.predictions import Prediction
@@ -22,17 +22,12 @@ from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.results.arrays import PLACES, result_of
 from jaxtrachea.results.hdf5 import SCHEMA, VERSION
-from jaxtrachea.results.store import BY_SAMPLE, GEOMETRY, read_data, read_json
+from jaxtrachea.results.store import BY_SAMPLE, GEOMETRY, HEADS, read_data, read_json
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Groups and datasets that are read; nothing else of the file is.
 READ = ("/model", "/study", "/data", *(f"/{place}" for place in PLACES.values()))
-#: Column of `data` that has the residual of each observed quantity of a lane.
-RESIDUALS = {
-    "force": "residual", "side_force": "side_residual", "joints": "joint_residual",
-    "joint_side": "joint_side_residual", "ends": "ends_residual",
-}  # fmt: skip
 
 
 class NoResults(ValueError):
@@ -213,29 +208,24 @@ def _study(file: Any, model: dict[str, Any], place: _Places, curves: tuple[Curve
 
 def _lanes(data: Any, place: _Places, arrays: dict[str, Any]) -> Lane:
     """The lanes out of what is stored of them, and of the curves."""
-    observed: dict[str, Any] = {"displacement": place.spread(numeric(data, "displacement"))}
-    for name, precision in FORCES + MARKERS:
-        weight = arrays.get(precision)
-        if weight is None:
-            observed[name] = arrays[precision] = None
-            continue
-        values = place.spread(numeric(data, name))
-        observed[name] = values if name == "force" else np.where(weight > 0, values, 0.0)
+    others = {}
+    for name, head in HEADS.items():
+        if name != "force" and (weight := arrays.pop(f"{head}precision", None)) is not None:
+            values = place.spread(numeric(data, name))
+            others[name] = Seen(np.where(weight > 0, values, 0.0), weight)
     if "time" in arrays:  # padding repeats the last
         arrays["time"] = np.maximum.accumulate(arrays["time"], axis=-1)
-    every: dict[str, Any] = {"blend": None} | arrays | observed
-    return Lane(**every)
+    pressed = {name: place.spread(numeric(data, name)) for name in ("displacement", "force")}
+    every: dict[str, Any] = {"blend": None} | arrays | pressed
+    return Lane(others=others, **every)
 
 
 def _residuals(data: Any, place: _Places, lanes: Lane) -> Prediction:
     """Model minus data, as the fit has left it."""
-    found: dict[str, Any] = {"joints": None}
-    found |= {
-        name: place.spread(numeric(data, column), np.nan)
-        for name, column in RESIDUALS.items()
-        if getattr(lanes, name) is not None
+    return {
+        name: place.spread(numeric(data, f"{HEADS[name]}residual"), np.nan)
+        for name in ("force", *lanes.others)
     }
-    return Prediction(**found)
 
 
 def _pair(found: Any) -> tuple[float, float] | None:

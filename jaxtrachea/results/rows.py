@@ -125,11 +125,11 @@ def with_residuals(
         cells: dict[str, object] = {}
         if specimen:
             trials = trials_of(result, lane, specimen)
-            own = float(rms(seen.force[lane, trials].ravel()))
+            own = float(rms(seen["force"][lane, trials].ravel()))
             curves = [result.study.curves[lane][t] for t in trials]
             peak = max(float(np.max(np.abs(c.force))) for c in curves)
             cells = {"rms_force_N": own, "rms_over_peak": own / peak if peak > 0 else np.nan}
-            if seen.joints is not None:
-                cells["rms_joints_mm"] = float(rms(seen.joints[lane, trials].ravel()))
+            if "joints" in seen:
+                cells["rms_joints_mm"] = float(rms(seen["joints"][lane, trials].ravel()))
         out.append(row | cells)
     return out

@@ -12,18 +12,21 @@ from typing import Any
 import h5py
 import numpy as np
 
-from jaxtrachea.fitting.lane import FORCES, MARKERS, markers
+from jaxtrachea.fitting.lane import forces, markers
+from jaxtrachea.fitting.lanes import measured
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.measurements.observed import FITTED, FITTED_NUMBERS, RINGS
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.measurements.readers.hdf5_values import numeric
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Arrays of the tube.
 GEOMETRY = tuple(f.name for f in dataclasses.fields(Geometry))
-#: Arrays of the lanes that follow from the data, and those that have a row for each sample.
-OBSERVED = ("displacement", *(name for name, _ in FORCES + MARKERS))
-BY_SAMPLE = (*(name for _, name in FORCES + MARKERS), "shares_plain", "time", "rising")
+#: Begin of the names of precisions and residuals of what is observed.
+HEADS = {"force": ""} | {name: f"{parts[0].short}_" for name, parts in FITTED.items()}
+#: Arrays of the study that have a row for each sample.
+BY_SAMPLE = (*(f"{head}precision" for head in HEADS.values()), "shares_plain", "time", "rising")
 #: Pieces of a column that are tried, rows of each, and the part that gzip must leave at most.
 PIECES, ROWS, WORTH = 16, 1024, 0.7
 
@@ -71,14 +74,16 @@ def write(
 
 def _write_lanes(group: h5py.Group, study: Study) -> None:
     """What of the lanes does not follow from the curves; samples end to end."""
-    arrays = study.lanes._asdict() | {
+    others = study.lanes.others.items()
+    arrays = study.lanes._asdict() | {f"{HEADS[name]}precision": v.precision for name, v in others}
+    arrays |= {
         "change_points": study.change_points,
         "record_zeros": study.record_zeros,
     }
     if study.shares is not None:
         arrays |= {f"shares_{name}": v for name, v in study.shares._asdict().items()}
     for name, values in arrays.items():
-        if values is None or name in OBSERVED:
+        if values is None or name in ("displacement", "force", "others"):
             continue
         values = np.asarray(values)
         if name in BY_SAMPLE:
@@ -131,7 +136,7 @@ def _columns(
     def of(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values[k, t, : len(c.force)] for k, t, c in rows])
 
-    force, residual = np.concatenate([c.force for c in curves]), of(seen.force)
+    force, residual = np.concatenate([c.force for c in curves]), of(seen["force"])
     yield "displacement", np.concatenate([c.displacement for c in curves])
     yield "force", force
     unknown = np.full(max(len(c.force) for c in curves), np.nan)
@@ -139,20 +144,14 @@ def _columns(
     yield "sigma", np.concatenate(sigma)
     yield "residual", residual
     yield "predicted", force + residual
-    if seen.joints is not None and study.lanes.joints is not None:
-        yield "joint_residual", of(seen.joints)
-        rings = study.model.geometry.rings
-        yield "joints", np.concatenate([_on_rings(c, rings) for c in curves])
-    if seen.side_force is not None:
-        given, found = np.concatenate([_side(c) for c in curves]), of(seen.side_force)
-        yield "side_force", given
-        yield "side_residual", found
-        yield "side_predicted", given + found
-    for kind in markers(study.lanes):
-        left = getattr(seen, kind.name)
-        if kind.name != "joints" and left is not None:
-            yield kind.name, of(np.where(kind.precision > 0, kind.data, np.nan))
-            yield f"{kind.name}_residual", of(left)
+    for kind in (forces(study.lanes) + markers(study.lanes))[1:]:
+        rings, head = study.model.geometry.rings, HEADS[kind.name]
+        given = np.concatenate([measured(c, kind.name, rings) for c in curves])
+        yield kind.name, given
+        residual = of(seen[kind.name])
+        yield f"{head}residual", residual
+        if kind.name in FITTED_NUMBERS:
+            yield f"{head}predicted", given + residual
     if study.model.relaxes:
         yield "time", np.concatenate([c.time for c in curves if c.time is not None])
 
@@ -168,20 +167,6 @@ def _packing(values: np.ndarray) -> dict[str, Any]:
     if sum(len(zlib.compress(b, 1)) for b in shuffled) > WORTH * sum(map(len, tried)):
         return {}
     return {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-
-
-def _side(curve: Curve) -> np.ndarray:
-    """Side force, NaN where not observed; (N,)."""
-    unknown = np.full(len(curve.force), np.nan)
-    return unknown if curve.side_force is None else curve.side_force
-
-
-def _on_rings(curve: Curve, rings: int) -> np.ndarray:
-    """Marker displacements in the columns of their rings, NaN elsewhere; (N, rings)."""
-    table = np.full((len(curve.force), rings), np.nan)
-    if curve.joint_displacement is not None and curve.joint_rings is not None:
-        table[:, curve.joint_rings] = curve.joint_displacement
-    return table
 
 
 def _short_source(source: str, names: Sequence[str]) -> str:
@@ -230,14 +215,10 @@ def read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]
                 source=source,
                 direction=(float(direction[i][0]), float(direction[i][1])),
                 rise=None if rise is None else (rise[i][0], rise[i][1]),
-                **{name: v if name in _OF_RINGS else v[part] for name, v in observed.items()},
+                **{name: v if name in RINGS else v[part] for name, v in observed.items()},
             )
         )
     return tuple(curves), numeric(group, "lane").astype(int), names["files"]
-
-
-#: Fields of a curve that have no axis of samples.
-_OF_RINGS = ("joint_rings", "end_rings")
 
 
 def _observed(group: Any) -> dict[str, Any]:
@@ -246,18 +227,13 @@ def _observed(group: Any) -> dict[str, Any]:
     Rings are numbered, with no axis of samples.
     """
     out: dict[str, Any] = {"time": numeric(group, "time")} if "time" in group else {}
-    if "joints" in group:
-        used = np.isfinite(numeric(group, "joint_residual"))
-        out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)
-    if "side_force" in group:
-        out["side_force"] = numeric(group, "side_force")
-    if "joint_side" in group:
-        out["joint_side_displacement"] = numeric(group, "joint_side")
-        out.setdefault("joint_displacement", np.full_like(out["joint_side_displacement"], np.nan))
-    if "joint_displacement" in out:
-        out["joint_rings"] = np.arange(out["joint_displacement"].shape[1])
-    if "ends" in group:
-        ends = numeric(group, "ends")
-        out["end_U"], out["end_V"] = ends[:, :, 0], ends[:, :, 1]
-        out["end_rings"] = np.arange(ends.shape[1])
+    for name, parts in FITTED.items():
+        if name not in group:
+            continue
+        values = numeric(group, name)
+        if parts[0].rings is not None:
+            used = np.isfinite(numeric(group, f"{HEADS[name]}residual"))
+            values, out[parts[0].rings] = np.where(used, values, np.nan), np.arange(used.shape[1])
+        for k, q in enumerate(parts):
+            out[q.name] = values[:, :, k] if len(parts) > 1 else values
     return out

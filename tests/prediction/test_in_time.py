@@ -235,7 +235,7 @@ def test_the_band_of_the_work_is_that_of_differences(read, fitted):
     study, h = read.study, 1e-5
 
     def work(theta):
-        off = predictions(study, theta[None]).force[0]
+        off = predictions(study, theta[None])["force"][0]
         rows = zip(study.curves[0], off, strict=False)
         return np.array([np.trapezoid(c.force + v[: len(c.force)], c.displacement)
                          for c, v in rows])  # fmt: skip

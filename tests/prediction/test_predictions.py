@@ -219,12 +219,11 @@ def test_an_angle_that_sections_were_not_tested_at_is_refused(half_angle, most):
 
 
 def test_rows_where_the_wall_moves_further_than_the_radius_are_told():
-    from jaxtrachea.prediction.core import Response
     from jaxtrachea.prediction.curves import _verdict
 
     source = source_like(PredictionStatus.OK)
     force = np.array([0.1, 0.2, 0.3])
-    value, se = Response(force, force[:, None], None), Response(force / 9, force[:, None], None)
+    value, se = {"force": force}, {"force": force / 9}
     presses = np.array([PressStatus.OK, PressStatus.TOO_DEEP, PressStatus.TOO_DEEP])
     status, message = _verdict(source, value, se, presses, 0.0)
     assert status == PredictionStatus.TOO_DEEP
@@ -232,7 +231,7 @@ def test_rows_where_the_wall_moves_further_than_the_radius_are_told():
     assert "2 samples: solved, but the wall is pressed in" in message
     assert _verdict(source, value, se, 0 * presses, 0.0)[0] == PredictionStatus.OK
     # A row without a number is worse.
-    lost = value._replace(force=np.array([0.1, 0.2, np.nan]))
+    lost = {"force": np.array([0.1, 0.2, np.nan])}
     presses[2] = PressStatus.PAST_FOLD
     status, message = _verdict(source, lost, se, presses, 0.0)
     assert status == PredictionStatus.NO_SOLUTION

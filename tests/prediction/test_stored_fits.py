@@ -44,7 +44,7 @@ def test_everything_comes_back_from_the_file(study, read):
     ]
     with h5py.File(read.origin.path) as file:
         seen = predictions(result.study, result.theta)
-        assert np.array_equal(file["data/residual"][: len(DEPTHS)], seen.force[0, 0])
+        assert np.array_equal(file["data/residual"][: len(DEPTHS)], seen["force"][0, 0])
 
 
 def old(folder):

@@ -11,13 +11,14 @@ from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Prog
 from jaxtrachea.inference.influence import Influence, influence
 from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
+from jaxtrachea.measurements.observed import FITTED_NUMBERS
 
 #: Rows of the tables on influence; the files hold all.
 _TOP = 12
 #: Change of an estimate, in standard errors, from which a curve is named.
 _MOVES = 1.0
 #: What entries of the residual are called, by field of the lane and place at a ring.
-_FORCES = {"force": "force", "side_force": "side force"}
+_FORCES = {"force": "force"} | {name: q.words for name, q in FITTED_NUMBERS.items()}
 _MOTIONS = {
     "joints": ("marker",), "joint_side": ("sideward marker",),
     "ends": ("end U y", "end U z", "end V y", "end V z"),

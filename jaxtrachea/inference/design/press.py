@@ -7,10 +7,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import full_precision
+from jaxtrachea.fitting.lane import forces
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.presses import HOLD_BEGINS
+from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.batching import PATHS
 from jaxtrachea.optimisation.programs import program
 
@@ -102,7 +104,7 @@ class Guess(NamedTuple):
     Attributes:
         theta: scaled coordinates; (P,).
         value: of all parameters, see `Lane`; (J,).
-        blend: as `force_jacobian`.
+        blend: see `Lane`; ().
         approach: how long before first touch the record begins, mm.
     """
 
@@ -139,8 +141,8 @@ def press_informations(
 
     Each is a path of its own there, and all together would take the memory.
     """
-    sides = study.lanes.side_force is not None
-    run = program(_information, study.model, samples, sides, axes=(None, 0))
+    names = tuple(kind.name for kind in forces(study.lanes)[1:])
+    run = program(_information, study.model, samples, names, axes=(None, 0))
     count = len(places.s)
     together = PATHS if study.model.level.iterates else count
     parts = []
@@ -152,10 +154,10 @@ def press_informations(
 
 
 @full_precision
-def _information(model: FitModel, samples: int, sides: bool, guess: Guess, place: Place):
+def _information(model: FitModel, samples: int, names: tuple[str, ...], guess: Guess, place: Place):
     """Information of one press with noise of 1 N on the unknowns; (P, P).
 
-    `sides`: whether it observes the side force.
+    `names`: what it observes beside the force.
     """
     theta, value, blend, approach = guess
     index = place.index[jnp.array(model.free_columns)]
@@ -166,10 +168,12 @@ def _information(model: FitModel, samples: int, sides: bool, guess: Guess, place
     touch = values_of(model, free, value)["onset"]
     displacement = touch + share * place.depth - (1 - share) * approach
     time = None if still is None else share * (place.depth + approach) / place.speed + still
-    J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi, time)
+    motion = Motion(place.s, displacement, blend=blend, phi_c=place.phi, time=time)
+    if place.phi is not None:
+        motion = motion._replace(direction=jnp.asarray([1.0, 0.0], theta.dtype))
+    J = force_jacobian(model, free, value, motion, names)
     if time is not None:  # the first sample is that of rest
         J = J.reshape(len(J), -1, samples + 1)[:, :, 1:].reshape(len(J), -1)
-    J = J if sides else J[:, :samples]
     at = jnp.where(index >= 0, index, len(theta))
     zero = jnp.zeros((len(theta), len(theta)), theta.dtype)
     gram = jnp.einsum("im,jm->ij", J, J)

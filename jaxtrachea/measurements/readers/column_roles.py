@@ -25,7 +25,7 @@ TRAVEL = (
 # Roles that a tidy table gives in every row; of a machine file its name gives them, if at all.
 OF_TIDY = ("specimen", "trial", "s", "phi")
 # Columns of time, taken where they have a unit; they tell the duration of holds.
-TIMES = ("time", "elapsed time", "total time", "test time", "running time")
+TIMES = ("time", "elapsed time", "total time", "test time", "running time", "zeit", "prüfzeit")
 #: Units of mass that scales and texture analysers write for a force.
 WEIGHTS = {"g": "gf", "kg": "kgf"}
 _NAMES = {*TRAVEL, *TIMES}.union(*ALIASES.values())
@@ -51,12 +51,16 @@ def name_and_unit(cell: str) -> tuple[str, str | None]:
     return name, unit
 
 
-def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
+def find_roles(
+    names: Sequence[str], options: ReadOptions, units: Sequence[str | None] = ()
+) -> dict[str, int]:
     """Which column plays which role: by `ReadOptions.columns`, else by the names in `ALIASES`.
 
     Args:
         names: column names without units.
         options: explicit names.
+        units: of the columns; of several of one name those in a unit of the role count, or in that
+            which the options have with the name.
 
     Returns:
         Role -> column index, for the roles found.
@@ -85,8 +89,14 @@ def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
             hits = [i for i, name in enumerate(names) if name in full]
             if not hits:
                 raise no_column(wanted, role, names)
+        if len(hits) > 1 and units:
+            meant = None if wanted is None else column_unit(wanted)[1]
+            own = [i for i in hits if units[i] == meant] if meant else []
+            hits = own or [i for i in hits if may_be(role, units[i])] or hits
         if len(hits) > 1:
-            several = ", ".join(repr(names[i]) for i in hits)
+            same = units and len({names[i] for i in hits}) < len(hits)
+            shown = [f"{names[i]} [{units[i]}]" if same else names[i] for i in hits]
+            several = ", ".join(map(repr, shown))
             raise Fault(
                 "ambiguous",
                 f"{several} can all be the {role}",

@@ -110,11 +110,11 @@ def _search(
             if sentences and not _is_above_numbers(header, lines[at + 1 :]):
                 continue
             try:
-                parts = _parts(header.names, options, lines[at - 1] if at else None, delimiter)
+                parts = _parts(header, options, lines[at - 1] if at else None)
             except Fault as fault:
                 # An ambiguous header is still the header, and so is one without a column that the
                 # options name; any other line is part of the preamble.
-                if fault.kind == "ambiguous" or _names_both(header.names, options):
+                if fault.kind == "ambiguous" or _names_both(header, options):
                     reason = fault
                 continue
             if _is_labview(text):
@@ -129,9 +129,7 @@ def _search(
     return None
 
 
-def _parts(
-    names: list[str], options: ReadOptions, above: Line | None, delimiter: str
-) -> list[Part]:
+def _parts(header: Header, options: ReadOptions, above: Line | None) -> list[Part]:
     """The columns of each trial: of all names, or of names that come again and again.
 
     A name that stands once, as the time, is that of all trials. ``Load 1`` and ``Load 2``
@@ -140,8 +138,9 @@ def _parts(
     Raises:
         Fault: a role is not there, or twice.
     """
+    names = header.names
     try:
-        roles = find_roles(names, options)
+        roles = find_roles(names, options, header.units)
         require_roles(roles, names)
         return [Part("1", roles)]
     except Fault as fault:
@@ -161,7 +160,7 @@ def _parts(
                 mine = counts[name] != most or seen[name] == k + 1
                 own.append(name if mine else "")
             try:
-                roles = find_roles(own, options)
+                roles = find_roles(own, options, header.units)
                 require_roles(roles, own)
             except Fault:
                 break
@@ -169,7 +168,7 @@ def _parts(
                 break
             parts.append(Part(str(k + 1), roles))
         if len(parts) == most:
-            return _titled(parts, above, delimiter)
+            return _titled(parts, above, header.delimiter)
     raise first
 
 
@@ -219,7 +218,7 @@ def _no_header(text: Text, named: Header | None, options: ReadOptions) -> Fault:
     what += f"; the columns of {text.word} {named.line} are {listed(named.names)}"
     columns = [(n, u) for n, u in zip(named.names, named.units, strict=True) if n]
     try:
-        roles = find_roles(named.names, options)
+        roles = find_roles(named.names, options, named.units)
     except Fault:
         roles = {}
     missing = [role for role in BOTH if role not in roles]
@@ -230,11 +229,12 @@ def _no_header(text: Text, named: Header | None, options: ReadOptions) -> Fault:
     return Fault("column_missing", what, cure)
 
 
-def _names_both(names: list[str], options: ReadOptions) -> bool:
+def _names_both(header: Header, options: ReadOptions) -> bool:
     """Whether columns are those of displacement and force, whatever else the options name."""
     columns = {role: name for role, name in options.columns.items() if role in BOTH}
     try:
-        return {*BOTH} <= find_roles(names, dataclasses.replace(options, columns=columns)).keys()
+        own = dataclasses.replace(options, columns=columns)
+        return {*BOTH} <= find_roles(header.names, own, header.units).keys()
     except Fault:
         return False
 

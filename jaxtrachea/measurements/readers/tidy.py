@@ -72,7 +72,7 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
                 f"no rows below the header in {text.word} {header.line}",
                 cure="export it again",
             )
-        roles = find_roles(header.names, options)
+        roles = find_roles(header.names, options, header.units)
         require_roles(roles, header.names)
         units = {
             role: _unit(role, table, roles[role], options)
@@ -390,7 +390,7 @@ def _is_tidy(text: Text, options: ReadOptions) -> bool:
     if lower & {*ALIASES["specimen"]} and (len(names) > 2 or pressed):
         return True
     try:
-        roles = find_roles(names, options)
+        roles = find_roles(names, options, units)
     except Fault:
         return False
     return {"displacement", "force"} <= roles.keys() and bool(columns_of_tidy(roles, units))

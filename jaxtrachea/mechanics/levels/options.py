@@ -98,7 +98,7 @@ class Options:
                 "relaxation='parts' needs coupling='series': with 'total' the force does not "
                 "depend on the skeleton; choose 'uniform'"
             )
-        if self.skeleton not in _OF_LINE:
+        if self.skeleton in _ONLY:
             raise ValueError(
                 f"relaxation='parts' is not derived for skeleton={self.skeleton!r}, whose wall has "
                 "no compliance of its own; choose 'uniform'"
@@ -114,7 +114,7 @@ class Options:
         return self.half_width, length - self.half_width
 
 
-#: Options that a skeleton has no choice of; no others apply to it.
+#: Options that a skeleton which is no line of joints has no choice of; no others apply to it.
 _ONLY = {
     "sections": {
         "coupling": "series", "split": "continuous", "form": "recursion", "shear": False,
@@ -123,8 +123,6 @@ _ONLY = {
     },
 }  # fmt: skip
 _NO_OTHER = "no other applies to it"
-#: Skeletons that are a line of joints.
-_OF_LINE = ("linear", "softening")
 
 
 def check_line(options: Options, what: str, *, timed: bool = False) -> None:
@@ -139,7 +137,7 @@ def check_line(options: Options, what: str, *, timed: bool = False) -> None:
         ValueError: naming what was called and the cure; or no `Options`.
     """
     check_word("options", options, Options)
-    if options.skeleton not in _OF_LINE:
+    if options.skeleton in _ONLY:
         raise ValueError(
             f"{what} presses a line of joints, not skeleton={options.skeleton!r}; "
             "use press_sections"
