@@ -56,6 +56,7 @@ WITHIN = {
         {"approach"},
         {"facts", "refusals", "deform", "programs", "overlap"},
         {"configurational", "dents", "lines"},
+        {"in_time"},
         {"together"},
         {"assemble", "simulation", "sweep", "anchor"},
         {"held_force", "one_row", "grip"},

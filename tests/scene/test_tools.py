@@ -507,6 +507,10 @@ def test_what_does_not_go_together():
             make_scene(TUBE, SPRINGS, paths, tool=tools, effects=BARE)
     with pytest.raises(ValueError, match="the path moves a tool"):
         make_scene(TUBE, SPRINGS, TWO_BALLS, effects=BARE)
+    one = {"left": TWO_BALLS["left"]}
+    scene = make_scene(TUBE, SPRINGS, one, tool={"left": BALL}, effects=BARE)
+    with pytest.raises(ValueError, match="a mapping of one tool goes through simulate alone"):
+        Session(scene, SPRINGS)
 
 
 @pytest.mark.parametrize(
