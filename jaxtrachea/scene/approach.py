@@ -11,7 +11,7 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
-from jaxtrachea.scene.instruments import scene_of, touch_together
+from jaxtrachea.scene.instruments import Pull, scene_of, touch_and_pull, touch_together
 from jaxtrachea.scene.landing import Landing, landing
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
@@ -53,12 +53,16 @@ def approach(scene: Scene, path: Poses) -> Approach:
 
 
 @full_precision
-def approach_together(scene: Scene, paths: Sequence[Poses]) -> list[Approach]:
-    """As `approach`, of all instruments of a scene; without `pull`."""
-    made = on_its_own if scene.plan.contact_point == "per_step" else _on_first_touch
+def approach_together(
+    scene: Scene, paths: Sequence[Poses]
+) -> tuple[list[Approach | None], Pull | None]:
+    """As `approach`, of all instruments of a scene, with one `pull` for all."""
+    if scene.plan.contact_point == "per_step":
+        made, (seen, pull) = on_its_own, touch_and_pull(scene, paths)
+    else:
+        made, seen, pull = _on_first_touch, touch_together(scene, paths), None
     views = [scene_of(scene, instrument) for instrument in scene.instruments]
-    each = zip(views, paths, touch_together(scene, paths), strict=True)
-    return [made(*one) for one in each]
+    return [made(*one) for one in zip(views, paths, seen, strict=True)], pull
 
 
 def _on_first_touch(scene: Scene, path: Poses, seen: Touch) -> Approach:

@@ -13,12 +13,17 @@ derivative of the search for the contact, at the pose where it stopped. So the w
 loop of poses is zero.
 """
 
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrachea.mechanics.energy import StraightPress, gradient
+from jaxtrachea.mechanics.press import local_law
 from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.instruments import Pull
 from jaxtrachea.scene.programs import Moved
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
@@ -58,9 +63,68 @@ def force_by_pose(
         used.s, used.phi, inward, moved.force, moved.depth, moved.slope_C, moved.loads
     )
     (poses,) = made.pull(Presses(by.s, by.phi, by.inward[:, None] * made.inward))
-    force = poses.translation
+    return _by_pose(path, poses, made.frame)
+
+
+def _by_pose(path: Poses, by: Poses, frame):
+    """Force and moment of derivatives by the poses, along the axes that forces are reported in."""
     # An infinitesimal turn w of R moves its columns r by w x r.
-    moment = jnp.sum(jnp.cross(path.rotation, poses.rotation, axis=1), axis=2)
-    if made.frame is not None:
-        force, moment = (jnp.einsum("ri,rij->rj", v, made.frame) for v in (force, moment))
+    moment = jnp.sum(jnp.cross(path.rotation, by.rotation, axis=1), axis=2)
+    if frame is None:
+        return by.translation, moment
+    force, moment = (jnp.einsum("ri,rij->rj", v, frame) for v in (by.translation, moment))
     return force, moment
+
+
+class Contacts(NamedTuple):
+    """Several solved presses along the inward normals, in one row.
+
+    Attributes:
+        s: contact positions, mm.
+        phi: contact angles, rad.
+        force: along the normals, N.
+        depth: local indentations, mm.
+    """
+
+    s: Float[Array, " m"]
+    phi: Float[Array, " m"]
+    force: Float[Array, "1 m"]
+    depth: Float[Array, "1 m"]
+
+
+def forces_by_poses(
+    scene: Scene,
+    material: Material,
+    solved: Contacts,
+    compliance: Callable[..., Float[Array, "m m"]],
+    ways: Sequence[tuple[Poses, Approach]],
+    pull: Pull,
+) -> dict[str, Float[Array, "1 m 3"]]:
+    """`force` and `moment` of tools that feel each other: dE/dpose of the energy of all.
+
+    With the displacements held it changes with the places by -F . dC F / 2 + dW, see
+    `mechanics.energy`.
+
+    Args:
+        scene: -
+        material: values that are not negative.
+        solved: the row.
+        compliance: what contacts feel of each other, mm/N, from their places and angles.
+        ways: the poses of every tool, and what they are to the wall.
+        pull: to derivatives by the poses.
+    """
+    F, options = solved.force[0], scene.plan.options
+
+    def stored(s, phi):
+        energy = -F @ (compliance(s, phi) @ F) / 2
+        if options.local == "two-material":
+            law = jax.vmap(lambda at: local_law(scene.geometry, material, at, options))(s)
+            energy += jnp.sum(jax.vmap(lambda law, d: law.energy(d * d))(law, solved.depth[0]))
+        return energy
+
+    by_s, by_phi = jax.grad(stored, (0, 1))(solved.s, solved.phi)
+    poses = pull([(one[:1], one[1:2], one[2:]) for one in jnp.stack([by_s, by_phi, -F], axis=1)])
+    each = zip(ways, poses, strict=True)
+    found = [_by_pose(path, by, made.frame) for (path, made), by in each]
+    force, moment = (jnp.stack(v, axis=1) for v in zip(*found, strict=True))
+    return {"force": force, "moment": moment}

@@ -1,7 +1,7 @@
 """Several tools of one scene: what each sees of it, their paths side by side, their contact."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,6 +11,9 @@ from jax.core import Tracer
 
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.stage import Instrument, Poses, Presses, Scene, check_path, touch_rows
+
+#: From derivatives by s, phi and gap of every tool to those by its poses.
+Pull = Callable[[list[tuple[Any, Any, Any]]], list[Poses]]
 
 
 def scene_of(scene: Scene, instrument: Instrument) -> Scene:
@@ -85,6 +88,17 @@ def _check_clocks(names: list[str], paths: list[Presses | Poses]) -> None:
                 f"path of tool {name!r} has {len(b)} rows and that of {names[0]!r} {len(a)}, and "
                 f"their times differ from row {row + 1} on; expected one clock: the same times"
             )
+
+
+def touch_and_pull(scene: Scene, paths: Sequence[Poses]) -> tuple[list[Touch], Pull]:
+    """As `touch_together`, and from derivatives by place and gap to those by the poses."""
+
+    def touched(paths):
+        seen = touch_together(scene, paths)
+        return [(one.s, one.phi, one.gap) for one in seen], seen
+
+    _, pull, seen = jax.vjp(touched, list(paths), has_aux=True)
+    return seen, lambda by: pull(by)[0]
 
 
 def touch_together(scene: Scene, paths: Sequence[Poses]) -> list[Touch]:

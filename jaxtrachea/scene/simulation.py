@@ -183,11 +183,11 @@ def _of_tools(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Press
 
 def _together(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Presses]) -> Simulation:
     """Several tools, each on one place."""
-    made: list[Approach | None] = [None] * len(paths)
+    made, pull = [None] * len(paths), None
     if poses := [path for path in paths if isinstance(path, Poses)]:
-        made = [*approach_together(scene, poses)]
+        made, pull = approach_together(scene, poses)
     before = before_path(scene, material, paths[0])
-    found, moved, _ = press_together(scene, material, paths, made, before=before)
+    found, moved, _ = press_together(scene, material, paths, made, before=before, pull=pull)
     vertices = deform_together(scene, moved)
     return as_simulation(found)._replace(vertices=vertices, time=paths[0].time)
 

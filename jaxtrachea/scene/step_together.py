@@ -19,7 +19,7 @@ from jaxtrachea.scene.approach import Approach, on_its_own
 from jaxtrachea.scene.grip import pick
 from jaxtrachea.scene.hold import hold
 from jaxtrachea.scene.in_time import Before, resting
-from jaxtrachea.scene.instruments import touch_together
+from jaxtrachea.scene.instruments import touch_and_pull, touch_together
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.simulation import Simulation, as_simulation
@@ -92,7 +92,11 @@ def move_tools(
         back = ~((dt >= 0) & jnp.isfinite(dt))
         dt, translation = jnp.where(back, 0, dt), jnp.where(back, jnp.nan, translation)
     paths = [Poses(R[None], T[None]) for R, T in zip(rotation, translation, strict=True)]
-    each, seen = views(scene), touch_together(scene, paths)
+    each, pull = views(scene), None
+    if scene.plan.contact_point == "per_step":
+        seen, pull = touch_and_pull(scene, paths)
+    else:
+        seen = touch_together(scene, paths)
     # One that is not present counts as clear of the wall. How a tool holds its place does not
     # depend on its shape: one program serves all.
     off = [
@@ -128,7 +132,7 @@ def move_tools(
         # A history that is unknown for one is so for all.
         lost = memory.press.lost
         before = Before(memory.press._replace(lost=jnp.max(lost)), dt=dt)
-    found, moved, history = press_together(scene, material, paths, ways, there[None], before)
+    found, moved, history = press_together(scene, material, paths, ways, there[None], before, pull)
     if memory is not None:
         assert history is not None
         kept = history._replace(lost=jnp.broadcast_to(history.lost, lost.shape))

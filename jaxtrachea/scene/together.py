@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea._numerics import full_precision, product, product_of_rows, scaled
+from jaxtrachea._numerics import full_precision, product_of_rows, scaled
 from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.contacts_in_time import solve_in_time
@@ -26,8 +26,9 @@ from jaxtrachea.mechanics.press_history import History, Samples
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene import dents, lines
 from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.configurational import Contacts, forces_by_poses
 from jaxtrachea.scene.in_time import Before, samples_of
-from jaxtrachea.scene.instruments import scene_of
+from jaxtrachea.scene.instruments import Pull, scene_of
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
@@ -73,6 +74,7 @@ def press_together(
     made: Sequence[Approach | None],
     present: Bool[Array, "rows m"] | None = None,
     before: Before | None = None,
+    pull: Pull | None = None,
 ) -> tuple[dict[str, Any], Together, History | None]:
     """Fields of a `Simulation` but the surface, what that follows from, and what is remembered.
 
@@ -85,6 +87,7 @@ def press_together(
         made: the way of each; None: its path is of presses.
         present: tools that are there; None: all, and those that are glued from first touch on.
         before: of a force that relaxes; else None.
+        pull: of a single row of tools that wander, see `configurational.forces_by_poses`.
     """
     each = views(scene)
     safe, bad = without_negative_values(scene, long_run(material))
@@ -102,7 +105,8 @@ def press_together(
     hidden = functools.reduce(jnp.logical_or, refused.values())
     presses, used = [p for p, *_ in found], [u for _, u, *_ in found]
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
-    D = jnp.stack([_inward_way(scene, *one) for one in zip(presses, phi, strict=True)], axis=1)
+    # Along their own normals: a tool that waits behind the tube is computed as one in front.
+    D = jnp.stack([jnp.sum(p.displacement * n, axis=1) for p, _, n, _ in found], axis=1)
     D = jnp.where(hidden[:, None], 0, D)
     unit = _influence(scene, safe, s, phi)
     if present is None and scene.plan.options.contact == "bonded":
@@ -124,6 +128,16 @@ def press_together(
     if scene.plan.ring_ends:
         rings |= {"end_U": does.lines.U, "end_V": does.lines.V}
     vectors = {"force": along(force), "depth": along(depth), "skeleton": does.skeleton}
+    if pull is not None:
+
+        def felt(s, phi):
+            return _felt(scene, _influence(scene, safe, s, phi).compliance)
+
+        solution = Contacts(s, phi, force, depth)
+        each_way: Any = list(zip(paths, made, strict=True))
+        vectors |= forces_by_poses(scene, safe, solution, felt, each_way, pull)
+        lost = ~jnp.isfinite(jnp.sum(vectors["force"] + vectors["moment"], axis=2))
+        solved = jnp.where((solved == PressStatus.OK) & lost, PressStatus.NON_FINITE, solved)
     fields = mask_rows(hidden, vectors | rings)
     share = [
         depth_share(v, fields["depth"][:, j], fields["skeleton"][:, j], found[j][2])
@@ -158,13 +172,6 @@ def _in_space(each: list[Scene], paths: Sequence[Poses | Presses], status):
     )
     word = jnp.asarray(PressStatus.TOOLS_OVERLAP, status.dtype)
     return jnp.where(plain & overlapping(tools, poses), word, status)
-
-
-def _inward_way(scene: Scene, presses: Presses, phi) -> Float[Array, " rows"]:
-    """Displacement of a tool along the inward normal, mm."""
-    if not scene.plan.second_plane:
-        return -presses.displacement[:, 1]
-    return product(presses.displacement, local_frame(phi)[0])
 
 
 def _along(normals: Float[Array, "m 3"], v: Float[Array, "rows m"]) -> Float[Array, "rows m 3"]:
@@ -207,9 +214,7 @@ def _forces(scene: Scene, material: Material, s, unit, D, present, samples: Samp
         width = jnp.asarray(options.onset_width, D.dtype)
     coupled = scene.plan.tools == "coupled"
     if samples is not None:
-        felt = options.coupling == "series"
-        C = C if coupled else jnp.diag(jnp.diag(C)) if felt else jnp.zeros_like(C)
-        found = solve_in_time(D, C, law, samples, width=width, present=present)
+        found = solve_in_time(D, _felt(scene, C), law, samples, width=width, present=present)
         return found.depth, found.force, found.elastic, found.status, found.history
     if coupled:
 
@@ -226,6 +231,13 @@ def _forces(scene: Scene, material: Material, s, unit, D, present, samples: Samp
 
     found = jax.vmap(alone, (1, 0, 0), 1)(D, jnp.diag(C), law)
     return found.depth, found.force, found.force, found.status, None
+
+
+def _felt(scene: Scene, C: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """The part of the compliance that contacts feel."""
+    if scene.plan.tools == "coupled":
+        return C
+    return jnp.diag(jnp.diag(C)) if scene.plan.options.coupling == "series" else jnp.zeros_like(C)
 
 
 @full_precision

@@ -408,30 +408,56 @@ def test_a_session_pinches_as_a_path_does():
     assert np.linalg.norm(lifted.force[0]) < 0.7 * np.linalg.norm(true.force[-1, 0])
 
 
+#: Round the tube from both sides, closed.
+ANGLE = np.linspace(0, 2 * np.pi, 61)
+UPRIGHT = np.broadcast_to(np.eye(3), (61, 3, 3))
+LOOPS = {
+    "left": np.stack([74 + 4 * np.cos(ANGLE), 2 * np.sin(ANGLE),
+                      OUTER + 2.8 + np.sin(2 * ANGLE) / 2], axis=1),
+    "right": np.stack([77 + 3 * np.sin(ANGLE), 1.5 * np.cos(ANGLE),
+                       -OUTER - 3 + 0.4 * np.cos(ANGLE)], axis=1),
+}  # fmt: skip
+
+
 @pytest.mark.long
-def test_tools_that_wander_press_where_they_are():
-    """Every row by itself along the normals, and so does a session; one may be lifted away."""
-    out = OUTER + 5
-    paths = {
-        "left": poses([70, 0, out - 1], [85, 0, out - 2.5], 3),
-        "right": poses([77, 1, -out + 0.5], [74, 3, -out + 2], 3),
-    }
+def test_tools_that_wander():
+    """Every row by itself, in a session too; their force is the derivative of the energy of all."""
+    paths = {name: Poses(UPRIGHT, places) for name, places in LOOPS.items()}
     scene = make_scene(TUBE, MATERIAL, paths, tool=dict.fromkeys(paths, BALL), effects=BARE)
     assert (scene.plan.contact_point, scene.plan.tools) == ("per_step", "coupled")
-    true = jax.device_get(simulate(scene, MATERIAL, paths))
+    true = jax.device_get(jax.jit(simulate)(scene, MATERIAL, paths))
     assert (true.status == OK).all()
+    way = np.stack([np.diff(places, axis=0) for places in LOOPS.values()], axis=1)
+    work = np.sum((true.force[1:] + true.force[:-1]) / 2 * way, axis=2)
+    assert abs(work.sum()) < 2e-4 * abs(work).sum()  # what the trapezoidal rule leaves
     session = Session(scene, MATERIAL)
-    for row in range(3):
+    for row in (0, 20, 37):
         s, phi, D = true.s[row], true.phi[row], -true.gap[row]
         found = press_contacts_oblique(TUBE, MATERIAL, s, phi, D[None])
-        np.testing.assert_allclose(true.force[row], found.force[0], rtol=0, atol=1e-13)
         np.testing.assert_allclose(true.joints[row], found.joints[0], rtol=0, atol=1e-13)
-        step = session.step({n: (p.rotation[row], p.translation[row]) for n, p in paths.items()})
+        step = session.step({name: (UPRIGHT[row], p[row]) for name, p in LOOPS.items()})
         np.testing.assert_allclose(step.force, true.force[row], rtol=0, atol=1e-13)
     lifted = session.step({}, present={"right": False})
     assert lifted.status.tolist() == [OK, NO_CONTACT]
     alone = press_contacts_oblique(TUBE, MATERIAL, s[:1], phi[:1], D[None, :1])
-    np.testing.assert_allclose(lifted.force[0], alone.force[0, 0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(lifted.joints[0], alone.joints[0, 0], rtol=0, atol=1e-13)
+
+
+@pytest.mark.long
+def test_a_tool_that_waits_behind_the_tube_changes_nothing():
+    """On the midline, of a tool that wanders: all as of the one, the part along the wall too."""
+    paths = {"left": ball([70, -2, 0], [78, -3, 0]), "right": poses([110, -27, 0], [112, -27, 0])}
+    effects = EffectOptions(want_surface=False, friction="off", axial="off")
+    scene = make_scene(TUBE, SPRINGS, paths, tool=dict.fromkeys(paths, BALL), effects=effects)
+    out = jax.jit(simulate)(scene, SPRINGS, paths)
+    one = make_scene(TUBE, SPRINGS, paths["left"], tool=BALL, effects=effects)
+    alone = jax.jit(simulate)(one, SPRINGS, paths["left"])
+    assert scene.plan.contact_point == one.plan.contact_point == "per_step"
+    assert (np.asarray(out.status) == [OK, NO_CONTACT]).all()
+    assert np.abs(out.force[:, 1]).max() < 1e-15
+    assert np.abs(alone.force[:, 0]).max() > 0.01
+    for name in ("force", "moment", "skeleton"):
+        np.testing.assert_allclose(getattr(out, name)[:, 0], getattr(alone, name), atol=1e-14)
 
 
 @pytest.mark.long
