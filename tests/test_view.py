@@ -531,3 +531,16 @@ def test_what_cannot_be_read_is_said(tmp_path):
     live.run()
     assert live.state.phase == "failed"
     assert "none.toml" in live.state.text
+
+
+@pytest.mark.long
+def test_one_tool_of_a_list_is_the_only_one(scene_file):
+    named = SCENE.replace("[tool]", '[[tool]]\nname = "ball"\nfriction = 0.3').replace(
+        "[[path]]", '[[path]]\ntool = "ball"'
+    )
+    path = scene_file.with_name("named.toml")
+    path.write_text(named)
+    handled = read_handled(path)
+    assert handled.names == ["tool"]
+    assert handled.staged.scene.plan.friction
+    assert handled.poses[0, 9:].tolist() == [30, 18, 0]

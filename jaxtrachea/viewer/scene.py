@@ -67,13 +67,22 @@ def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> H
     Raises:
         SpecError: a file or a value that cannot be used, with its key.
     """
-    spec = load_scene_spec(path)
+    spec = _without_the_name_of_one(load_scene_spec(path))
     changed, notes = for_a_mouse(spec)
     staged = stage(changed, path.parent, lambda text: begin(text))
     if spec.tool is None:
         notes += (f"the scene has no tool: a finger ({_words(FINGER)}) is used",)
     poses = _start(spec, staged, path.parent)
     return Handled(spec.title or path.stem, staged, poses, (*staged.notes, *notes))
+
+
+def _without_the_name_of_one(spec: SceneSpec) -> SceneSpec:
+    """A single tool of a list as the only one: one tool may stick, slide and relax."""
+    if len(spec.names) != 1:
+        return spec
+    tool = spec.tool[0].model_copy(update={"name": None}) if isinstance(spec.tool, list) else None
+    legs = [leg.model_copy(update={"tool": None}) for leg in spec.path]
+    return spec.model_copy(update={"tool": tool, "path": legs})
 
 
 def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
