@@ -109,6 +109,28 @@ def test_every_sample_has_the_active_set_that_fits():
 
 
 @pytest.mark.long
+def test_float32_in_lanes():
+    """Of records that are scaled: each lane as by itself, to the digits of its dtype."""
+    given = jnp.array(C), law_of(3), at_rest_of(3), jnp.asarray(1e-3)
+    ways = jnp.stack([jnp.array(WAYS), 0.5 * jnp.array(WAYS)])
+
+    @jax.jit
+    def lanes(ways, given):
+        C, law, samples, width = given
+        return jax.vmap(lambda D: solve_in_time(D, C, law, samples, width=width).force)(ways)
+
+    true = lanes(ways, given)
+    as_float32 = jax.tree.map(
+        lambda v: v.astype("float32") if v.dtype == "float64" else v, (ways, given)
+    )
+    found = lanes(*as_float32)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, true, rtol=0, atol=2e-5)
+    alone = lanes(ways[1:], given)
+    np.testing.assert_allclose(alone[0], true[1], rtol=0, atol=1e-13)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("contact", ["unilateral", "bonded"])
 def test_one_contact_is_a_press_that_relaxes(contact):
     """Outside of the rounding of the first touch; glued, it pulls."""
@@ -236,7 +258,7 @@ def test_a_session_of_tools_relaxes_as_a_path_does():
     state, out = scan(jt.init_state(scene, material))
     np.testing.assert_array_equal(out.force, force)
     jax.tree.map(np.testing.assert_array_equal, state, kept)
-    back = session.step({}, dt=np.float64(-1))
+    back = session.step({"left": poses(0)["left"]}, dt=np.float64(-1))
     assert (back.status == PressStatus.BACK_IN_TIME).all()
     jax.tree.map(np.testing.assert_array_equal, session.state, kept)
     lifted = session.step({}, present={"left": False}, dt=np.float64(0))

@@ -113,13 +113,11 @@ def solve(
         present: contacts that are there; the others have no force, whatever their displacement.
         start: forces to begin with, N, say of the row before; they change the number of steps, and
             the result by rounding alone.
-        floor: of unilateral contacts, elastic forces that the wall has where its tool has let go,
-            N, not negative (`contacts_in_time`); 0 if None. A contact is lifted where the force is
-            no more than that, and has its own depth under it then.
+        floor: of unilateral contacts, elastic force that the wall has where its tool has let go,
+            N, not negative (`contacts_in_time`), with the depth under it; 0 if None.
 
     Returns:
-        The `ContactForces`. LIFTED: alone the tool would touch (D_j > 0 without a floor), but the
-        wall is moved away by another one, no force.
+        The `ContactForces`. LIFTED: alone it would touch, but another tool moves the wall away.
         NOT_CONVERGED: the numbers are too stiff against each other for their precision (k C near
         1 / epsilon); no contact has a number then, nor where one input is not finite.
     """

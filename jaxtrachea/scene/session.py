@@ -137,16 +137,14 @@ class Session:
         pose += (np.zeros((), self.dtype),) if self._timed else ()
         self._program = OneRow(self.scene, row.setting, row.step, self._start, *pose, self._numbers)
 
-    def _known(self, turn, place, there):
-        """Where tools stand after a step: a pose that was no number is forgotten."""
-        finite = np.isfinite(place).all(1) & np.isfinite(turn).all((1, 2))
-        if finite.all():
-            return turn, place, there
+    def _known(self, turn, place, there, dt=0.0):
+        """Where tools stand after a step: what was no number, or at no time, is forgotten."""
         old = self._stands
-        return (
-            np.where(finite[:, None, None], turn, old[0]),
-            np.where(finite[:, None], place, old[1]), there,
-        )  # fmt: skip
+        if not 0 <= dt < np.inf:
+            return old
+        finite = np.isfinite(place).all(1) & np.isfinite(turn).all((1, 2))
+        turn = np.where(finite[:, None, None], turn, old[0])
+        return turn, np.where(finite[:, None], place, old[1]), there
 
     def _no_force(self) -> LastForce:
         return no_force(self.dtype, len(self.scene.instruments))
@@ -225,7 +223,7 @@ class Session:
             # Two arrays: to make one of them takes longer than it saves.
             result = self._program(*pose, self._numbers)
             if self.scene.instruments:
-                self._stands = self._known(*pose[:3])
+                self._stands = self._known(*pose)
             self._last_force = next_force(self._last_force, result)
             self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
             self._steps += 1

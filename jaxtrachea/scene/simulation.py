@@ -77,7 +77,7 @@ class Simulation(NamedTuple):
         slip: way the tool has slid over the surface (friction).
         dissipated: work lost in each row, N mm: to friction (of a session also by its place, which
             follows or gives way and may give a little back), or in `simulate` to what relaxes (None
-            with a skeleton that softens or of deforming cross-sections, where it is not derived).
+            of several tools, a skeleton that softens or deforming cross-sections: not derived).
         frame: columns tangent, anterior, lateral at the contact; shape (rows, 3, 3). None: the tube
             is straight, or the contact points are given.
         vertices: deformed surface in the frame of the mesh; shape (rows, vertices, 3).

@@ -1,25 +1,32 @@
 """Several contacts that feel one another, against one contact alone, in lanes.
 
-    python tests/bench/contacts.py [--lanes 64] [--rounds 40]
+    python tests/bench/contacts.py [--lanes 64] [--rounds 40] [--scene configs/two_fingers.toml]
 
 Skeleton and forces of m tools (`press_contacts`), and the skeleton alone (`influence`), over one
 `deflect` and one `press`, each on tubes of other stiffness. Compilation is that of one call, once.
+With --scene instead steps of a session of all its tools, over those of its first tool alone.
 """
 
 import argparse
+import dataclasses
 import statistics
 import time
+from pathlib import Path
 
 import common  # noqa: F401  (pins one core, before numpy and jax)
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea import Session
 from jaxtrachea.mechanics.beam import deflect
 from jaxtrachea.mechanics.influence import influence
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.press import ligament_beam, press
 from jaxtrachea.mechanics.press_contacts import press_contacts
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.instruments import scene_of
+from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
@@ -46,12 +53,46 @@ def compiled(function, *given):
     return lambda: jax.block_until_ready(run(*given)), seconds
 
 
+def sessions(file: Path, rounds: int) -> None:
+    """Steps along the paths of a scene, in turns; seconds of the processor to compile."""
+    staged = stage(load_scene_spec(file), file.parent)
+    scene, paths = staged.scene, staged.path
+    assert isinstance(paths, dict)
+    first, rows = scene.instruments[0], max(len(p.translation) for p in paths.values())
+    plan = dataclasses.replace(scene.plan, tools="one")
+    alone = dataclasses.replace(scene_of(scene, first), plan=plan)
+    taken, made = {}, {}
+    for name, of in (("one", alone), ("all", scene)):
+        start = time.process_time()
+        made[name], taken[name] = Session(of, staged.material), []
+        print(f"{name}: compiled in {time.process_time() - start:.0f} s of processor time")
+
+    def pose(path, row):
+        return tuple(np.asarray(v[min(row, len(v) - 1)]) for v in (path.rotation, path.translation))
+
+    for _ in range(rounds):
+        for row in range(rows):
+            one, every = pose(paths[first.name], row), {n: pose(p, row) for n, p in paths.items()}
+            for name, given in (("one", one), ("all", (every,))):
+                start = time.perf_counter()
+                made[name].step(*given)
+                taken[name].append(time.perf_counter() - start)
+    for name, times in taken.items():
+        median, late = np.quantile(times[rows:], (0.5, 0.99))
+        ratio = median / np.median(taken["one"][rows:])
+        print(f"{name}: {1e6 * median:.0f} us, {ratio:.2f} x one; p99 {late / median:.1f} medians")
+
+
 def main():
     """Print ratios of medians."""
     parser = argparse.ArgumentParser(description="Several contacts against one")
     parser.add_argument("--lanes", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=40)
+    parser.add_argument("--scene", type=Path)
     asked = parser.parse_args()
+    if asked.scene:
+        sessions(asked.scene, asked.rounds)
+        return
     rng, lanes = np.random.default_rng(0), asked.lanes
     k_M, s, D = (rng.uniform(*r, lanes) for r in ((0.1, 0.3), (5, 155), (0, 6)))
     compiled(lambda k, s: deflect(beam(k), s, jnp.ones_like(s)), k_M, s)  # what is done once

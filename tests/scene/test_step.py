@@ -219,7 +219,7 @@ def test_a_state_of_another_scene_is_refused(rubbed):
         with pytest.raises(ValueError, match=says):
             jt.step(scene, material, state, jnp.asarray(EYE), jnp.asarray(down))
     older = dataclasses.replace(kept, origin=origin._replace(version=stepping.STATE_VERSION - 1))
-    with pytest.raises(ValueError, match="state has version 3; expected 4"):
+    with pytest.raises(ValueError, match="state has version 4; expected 5"):
         session.state = older
     same(session.state, kept)
     np.testing.assert_array_equal(session.step(EYE, down).force, known)
