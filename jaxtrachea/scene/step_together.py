@@ -13,7 +13,6 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import long_run
-from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import Instant
 from jaxtrachea.scene.approach import Approach
@@ -93,8 +92,31 @@ def move_tools(
         back = ~((dt >= 0) & jnp.isfinite(dt))
         dt, translation = jnp.where(back, 0, dt), jnp.where(back, jnp.nan, translation)
     paths = [Poses(R[None], T[None]) for R, T in zip(rotation, translation, strict=True)]
-    seen = touch_together(scene, paths)
-    after, made, touching, known = _hold(scene, material, state, paths, seen, present, rest)
+    each, seen = views(scene), touch_together(scene, paths)
+    # One that is not present counts as clear of the wall. How a tool holds its place does not
+    # depend on its shape: one program serves all.
+    off = [
+        eqx.tree_at(lambda v: v.gap, without_part(v), jnp.where(there, v.gap, 1 + jnp.abs(v.gap)))
+        for v, there in zip(seen, present, strict=True)
+    ]
+    at = [whereabouts(*one) for one in zip(each, paths, off, strict=True)]
+    footprints = [view.footprint for view in each]
+    rows = jax.tree.map(lambda *v: jnp.stack(v), *zip(paths, off, at, footprints, strict=True))
+
+    def one(row):
+        old, (path, touch, at, footprint) = row
+        view = dataclasses.replace(each[0], footprint=footprint)
+        at = jax.tree.map(lambda v: v[0], at)
+        side = next_side(old.side, at)
+        inside = (side == Side.IN_LUMEN)[None]
+        here = Instant(path, touch)
+        new, _, made, held = hold(view, long_run(material), old, here, inside, rest)
+        if new.memory is not None:
+            made = _where_pressed(made, new.memory, held.touching)
+        new = pick(at.known, dataclasses.replace(new, side=side), old)
+        return new, made, held.touching, at.known
+
+    after, made, touching, known = jax.lax.map(one, (state, rows))
     there = present & touching if scene.plan.options.contact == "bonded" else present
     ways = [jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)]
     memory, before = after.memory, None
@@ -112,39 +134,6 @@ def move_tools(
     status = jnp.where(jnp.all(known), result.status, why.astype(result.status.dtype))
     after = dataclasses.replace(after, present=jnp.where(back, state.present, present))
     return after, result._replace(status=status), (moved,)
-
-
-def _hold(
-    scene: Scene, material: AnyMaterial, state: Any, paths: list[Poses], seen: list[Touch],
-    present, rest: History | None,
-) -> tuple[Any, Approach, Bool[Array, " m"], Bool[Array, " m"]]:  # fmt: skip
-    """All tools on their places: next states, ways, who is on its place, whose pose is known.
-
-    One that is not present counts as clear of the wall. How a tool holds its place does not depend
-    on its shape: one program serves all.
-    """
-    each = views(scene)
-    off = [
-        eqx.tree_at(lambda v: v.gap, without_part(v), jnp.where(there, v.gap, 1 + jnp.abs(v.gap)))
-        for v, there in zip(seen, present, strict=True)
-    ]
-    at = [whereabouts(*one) for one in zip(each, paths, off, strict=True)]
-    footprints = [view.footprint for view in each]
-    rows = jax.tree.map(lambda *v: jnp.stack(v), *zip(paths, off, at, footprints, strict=True))
-
-    def one(row):
-        old, (path, touch, at, footprint) = row
-        view = dataclasses.replace(each[0], footprint=footprint)
-        at = jax.tree.map(lambda v: v[0], at)
-        side = next_side(old.side, at)
-        inside, here = (side == Side.IN_LUMEN)[None], Instant(path, touch)
-        new, _, made, held = hold(view, long_run(material), old, here, inside, rest)
-        if new.memory is not None:
-            made = _where_pressed(made, new.memory, held.touching)
-        new = pick(at.known, dataclasses.replace(new, side=side), old)
-        return new, made, held.touching, at.known
-
-    return jax.lax.map(one, (state, rows))
 
 
 def _where_pressed(made: Approach, memory: Memory, touching: Bool[Array, ""]) -> Approach:
