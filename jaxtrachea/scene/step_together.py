@@ -35,7 +35,7 @@ def without_part(seen: Touch) -> Touch:
 
 
 def placed(
-    names: list[str], stands: tuple, poses: Any, translation: Any, present: Mapping[str, Any],
+    names: list[str], stands: tuple, poses: Any, translation: Any, present: Any,
     check: Callable[[Any, Any, str], tuple],
 ) -> tuple[list, list, list]:  # fmt: skip
     """Rotations and translations of several tools, and which of them are there.
@@ -56,11 +56,15 @@ def placed(
             "poses by name, and the scene has one tool without a name; expected rotation and "
             "translation, or a scene made with a mapping of paths"
         )
-    if not isinstance(poses, Mapping) or translation is not None:
+    if isinstance(poses, Mapping) and translation is not None:
+        raise ValueError("poses by name and a second value; give dt by its name, as in dt=0.001")
+    if not isinstance(poses, Mapping):
         raise ValueError(
             f"one pose, and the scene has the tools {', '.join(map(repr, names))}; expected a "
             "mapping of names to (rotation, translation)"
         )
+    if not isinstance(present, Mapping):
+        raise ValueError(f"present is {present!r}; expected a mapping of names to True or False")
     if unknown := [name for name in (*poses, *present) if name not in names]:
         raise ValueError(f"there is no tool {unknown[0]!r}; expected {', '.join(map(repr, names))}")
     turns, places, there = map(list, stands)
@@ -70,6 +74,8 @@ def placed(
         i, (turn, place) = names.index(name), pose
         (turns[i], places[i]), there[i] = check(turn, place, f"{name!r}: "), True
     for name, is_there in present.items():
+        if not isinstance(is_there, bool) and str(getattr(is_there, "dtype", "")) != "bool":
+            raise ValueError(f"present of {name!r} is {is_there!r}; expected True or False")
         there[names.index(name)] = is_there
     return turns, places, there
 
