@@ -13,6 +13,7 @@ from jaxtrachea.fitting.few_samples import few_samples, same_ends, serves
 from jaxtrachea.fitting.information import Information, informations, pooled, unknown_count
 from jaxtrachea.fitting.lane import data_weight
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
+from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.shared import solve_jointly
 from jaxtrachea.fitting.starts import add_starts, best, draw_starts
@@ -127,6 +128,8 @@ def _from_starts(study: Study, settings: Settings, starts, sigma, progress, besi
         solved, agree = _solve_jointly(study, settings, starts, sigma, progress)
         tried = np.full(lanes, len(starts) // lanes)
         return solved, np.full(lanes, agree), tried, np.arange(lanes), solved.theta, solved.cost
+    if drawn:
+        starts = _beside_records(study, settings, starts, sigma)
     rows = np.repeat(np.arange(lanes), settings.starts)
     solve = _by_few_samples if drawn and serves(study, settings, len(rows)) else _solve
     solved = solve(study, settings, rows, starts, sigma, progress)
@@ -138,6 +141,27 @@ def _from_starts(study: Study, settings: Settings, starts, sigma, progress, besi
     tried = np.bincount(rows, minlength=lanes)
     chosen = Solved(*(v[lowest] for v in solved))
     return chosen, agree, tried, rows, solved.theta, solved.cost
+
+
+def _beside_records(study: Study, settings: Settings, starts, sigma):
+    """Starts; of lanes with lines below the force after a fit with their presses held.
+
+    Onset, offset and line of a press are known from its record. Beside a stiffness that is far off
+    they would go astray together.
+    """
+    of_presses = study.of_unknowns(lambda p: float(p.name in OF_THE_PRESS), 0.0) > 0
+    lines = study.of_unknowns(lambda p: float(p.name == "force_slope"), 0.0) > 0
+    lanes = np.flatnonzero(lines.any(axis=1))
+    if not len(lanes):
+        return starts
+    each = starts.reshape(len(lines), settings.starts, -1).copy()
+    each = np.where(of_presses[:, None], each[:, :1], each)
+    rows = np.repeat(lanes, settings.starts)
+    first = each[lanes].reshape(len(rows), -1)
+    found = _solve_more(reduced(study, of_presses), settings, sigma, None, rows, first)
+    good = np.isfinite(found.cost)[:, None]
+    each[lanes] = np.where(good, found.theta, first).reshape(len(lanes), settings.starts, -1)
+    return each.reshape(starts.shape)
 
 
 def _with_one_more(

@@ -8,6 +8,7 @@ record could show: nothing is taken there.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -108,13 +109,40 @@ def zeros_of(
     given = [sigma if c.sigma is None else float(np.median(c.sigma)) for c in curves]
     held = {p.name: p.value for p in table if p.fixed and not p.auto}
     onset, offset = held.get("onset", 0.0), held.get("force_offset", 0.0)
-    zeros = record_zeros(
+    records = _Records(
         [c.displacement - onset if onset else c.displacement for c in curves],
         [c.force - offset if offset else c.force for c in curves],
         np.array([np.nan if s is None else s for s in given]),
     )
+    zeros = _beside_others(record_zeros(*records), curves, records)
     at_zero = np.where(zeros.force_slope, zeros.offset - zeros.slope * onset, zeros.offset)
     return zeros._replace(touch=zeros.touch + onset, offset=at_zero + offset)
+
+
+class _Records(NamedTuple):
+    """As `record_zeros` takes them."""
+
+    displacement: list[np.ndarray]
+    force: list[np.ndarray]
+    sigma: np.ndarray
+
+
+def _beside_others(zeros: Zeros, curves: Sequence[Curve], records: _Records) -> Zeros:
+    """What records show beside the line of others of their specimen, where theirs is not clear.
+
+    A line is of the rig. A record in which a rising force hides the touch shows it above that line.
+    """
+    specimen = np.unique([c.specimen for c in curves], return_inverse=True)[1].reshape(-1)
+    out = Zeros(*map(np.array, zeros))
+    for k in np.unique(specimen[zeros.force_slope]):
+        slope = float(np.median(zeros.slope[(specimen == k) & zeros.force_slope]))
+        rows = np.flatnonzero((specimen == k) & ~zeros.force_slope)
+        level = [records.force[i] - slope * records.displacement[i] for i in rows]
+        found = record_zeros([records.displacement[i] for i in rows], level, records.sigma[rows])
+        seen = found.onset & (found.air >= LINE)
+        for whole, values in zip(out, found._replace(slope=found.slope + slope), strict=True):
+            whole[rows[seen]] = values[seen]
+    return out
 
 
 def without_line(curves: Sequence[Curve], zeros: Zeros) -> list[InputError | None]:
