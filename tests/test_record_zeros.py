@@ -82,6 +82,16 @@ def test_lines_are_shown_where_there_is_air():
     assert np.isnan(zeros.slope).all()
 
 
+@pytest.mark.parametrize("slope", [-0.3, -0.05, 0.03, 0.1, 0.15])
+def test_lines_that_rise_are_shown_as_those_that_fall(slope):
+    """Of a third of the record in air; none of a force that rises in air was taken for air."""
+    _, D, F = recorded(np.random.default_rng(2003), 10, air=1.6, slope=slope, samples=100)
+    zeros = record_zeros(D, F)
+    assert (zeros.onset & zeros.force_offset & zeros.force_slope).mean() >= 0.95
+    np.testing.assert_allclose(np.median(zeros.touch), 1.6, atol=0.1 if slope > -0.1 else 0.4)
+    np.testing.assert_allclose(np.nanmedian(zeros.slope), slope, atol=0.005)
+
+
 def test_a_line_is_told_by_its_force_at_no_displacement():
     """Of a record that begins at 5 mm: 0.5 N - 0.03 N/mm D in air, known to 1e-3 N at D = 0."""
     D = np.linspace(5, 11, 121)
