@@ -18,10 +18,11 @@ from jaxtrachea.fitting.zero_messages import cells, sentences
 from jaxtrachea.inference.design.press import index_of_presses, of_a_new_press
 from jaxtrachea.measurements.read import Curve, Measurements
 from jaxtrachea.measurements.record_zeros import record_zeros
-from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.prediction.held_out import compare
 from jaxtrachea.prediction.sources import source_of
 from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.material import Material
 
 AIR, SIGMA = 0.6, 0.005
 HELD = {"onset": {"fixed": True, "value": 0.0}, "force_offset": {"fixed": True, "value": 0.0}}
@@ -242,8 +243,26 @@ def test_a_rising_line_is_of_all_curves_and_the_fit_finds_the_truth():
     assert sum(p.name == "force_slope" for p, _, _ in study.unknowns[0]) == len(found)
     result = fit(study)
     assert result.succeeded.all()
-    truth = {"EI_L": 900.0, "k_M": 0.3, "k_1": 8.0, "k_3": 20.0, "onset": 1.0,
-             "force_offset": 0.0, "force_slope": 0.05}  # fmt: skip
+    truth = {"EI_L": 900.0, "k_M": 0.3, "k_1": 8.0, "k_3": 20.0, "onset": 0.8,
+             "force_offset": 0.0, "force_slope": 0.1}  # fmt: skip
     for i, (p, _, _) in enumerate(study.unknowns[0]):
         low, high = result.lower[0, i], result.upper[0, i]
         assert low - (high - low) <= truth[p.name] <= high + (high - low), p.name
+
+
+@pytest.mark.slow
+def test_lines_of_seven_presses_end_in_the_right_minimum():
+    """1 mm of air and 0.02 N/mm: two of three specimens ended at EI_L 15, no start near 1400."""
+    material = Material(EI_L=1400.0, k_M=0.2, k_1=0.5, k_3=0.05)
+    D, rng = np.linspace(0, 6, 121), np.random.default_rng(5)
+    found = []
+    for specimen in range(3):
+        for s in (20.0, 35.0, 50.0, 66.0, 75.0, 92.0, 110.0):
+            F = np.asarray(press(table_1(), material, s, np.maximum(D - 1, 0)).force)
+            F = np.where(D > 1, F, 0) + 0.02 * D + 0.003 * rng.normal(size=D.size)
+            found.append(Curve(f"{specimen}", f"{s:g}", s, 0.0, D, F))
+    result = fit(build_study(found, table_1()))
+    assert result.succeeded.all()
+    truth = [material.EI_L, material.k_M, material.k_1, material.k_3]
+    half = (result.upper - result.lower)[:, :4]
+    assert (np.abs(result.value[:, :4] - truth) < half).all()
