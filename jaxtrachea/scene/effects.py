@@ -270,8 +270,7 @@ def _no_lines(case: Case) -> tuple[str, str] | None:
     """Why several tools cannot press as vectors, and the cure; None: they can, without friction."""
     levels = case.levels
     if levels["friction"] == "on":
-        off = "set friction 'off' and contact_point 'fixed'"
-        return "friction is derived for one tool", off
+        return "friction is derived for one tool", "set friction 'off'"
     if case.facts.drags and case.prescribed:
         return (
             "one of them moves along the wall by more than a twentieth of its way: what it drags "

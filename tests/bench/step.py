@@ -4,8 +4,8 @@
 
 Each version runs in a process of its own; they work in turns, 100 steps each, an empty call after
 every step. A step ends with its force, gap and status read by numpy. A ball goes up and down on the
-tube: straight, in one plane; a little aslant, forces only; and with the deformed surface of the
-generated trachea (6,856 triangles, dent of 16). Medians, 99 % and smallest in us, and ratios.
+tube: straight, in one plane; a little aslant, forces only; so with friction; and with the deformed
+surface of the generated trachea (6,856 triangles, dent of 16). Medians, 99 % and smallest in us, and ratios.
 """
 
 import os
@@ -14,7 +14,7 @@ import sys
 import time
 
 BLOCK, BLOCKS = 100, 100
-KINDS = "plane", "forces", "surface"
+KINDS = "plane", "forces", "friction", "surface"
 
 
 def work(kind: str) -> None:
@@ -26,7 +26,7 @@ def work(kind: str) -> None:
     import numpy as np
     from small_scenes import BALL, BARE, MATERIAL, OUTER, SPRINGS, TUBE, ball
 
-    from jaxtrachea import EffectOptions, Session, make_scene
+    from jaxtrachea import EffectOptions, Session, Tool, make_scene
     from jaxtrachea.trachea.tube import make_tube
 
     aslant = float(kind != "plane")
@@ -37,7 +37,10 @@ def work(kind: str) -> None:
     effects = EffectOptions(**{**vars(BARE), **how})
     mesh = make_tube(TUBE, around=36, along=160) if kind == "surface" else None
     start = ball([75, 1, 0], [75 + aslant, -2, aslant])
-    scene = make_scene(TUBE, material, start, tool=BALL, mesh=mesh, effects=effects)
+    tool = Tool(BALL, 0.3) if kind == "friction" else BALL
+    if kind == "friction":
+        effects = EffectOptions(**{**vars(effects), "friction": "on"})
+    scene = make_scene(TUBE, material, start, tool=tool, mesh=mesh, effects=effects)
     session, empty, zero = Session(scene, material), jax.jit(jnp.negative), jnp.zeros(())
     turn, angle = np.eye(3), np.linspace(0, 2 * np.pi, BLOCK)
     down = np.maximum(0, 1.5 - 2 * np.cos(angle))
