@@ -5,7 +5,8 @@
 Each version runs in a process of its own; they work in turns, 100 steps each, an empty call after
 every step. A step ends with its force, gap and status read by numpy. A ball goes up and down on the
 tube: straight, in one plane; a little aslant, forces only; so with friction; and with the deformed
-surface of the generated trachea (6,856 triangles, dent of 16). Medians, 99 % and smallest in us, and ratios.
+surface of the generated trachea (6,856 triangles, dent of 16). Medians, 99 % and smallest in us,
+and ratios.
 """
 
 import os
