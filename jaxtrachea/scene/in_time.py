@@ -37,28 +37,21 @@ def before_path(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> B
     Raises:
         ValueError: a path without times.
     """
-    if not isinstance(material, RelaxingMaterial) or not scene.plan.has("relaxation"):
+    if (rest := resting(scene, material)) is None:
         return None
     if path.time is None:
         raise ValueError("path.time is None; expected a time for every row: the plan relaxes")
-    return Before(rest_of(scene, material.relaxation), path.time)
-
-
-def rest_of(scene: Scene, relaxation: Relaxation) -> History:
-    """The history of nothing; of several tools with an axis of them."""
-    plan, tools = scene.plan, len(scene.instruments)
-    vector = plan.second_plane or not plan.mechanics.hangs_on_rings
-    rest = at_rest(relaxation, plan.options, vector and not tools)
-    return each_at_rest(rest, tools) if tools else rest
+    tools = len(scene.instruments)
+    return Before(each_at_rest(rest, tools) if tools else rest, path.time)
 
 
 def resting(scene: Scene, material: AnyMaterial) -> History | None:
     """The history of nothing, of one tool; None: the force does not relax."""
-    if not scene.plan.has("relaxation"):
+    plan = scene.plan
+    if not isinstance(material, RelaxingMaterial) or not plan.has("relaxation"):
         return None
-    assert isinstance(material, RelaxingMaterial)
-    vector = scene.plan.second_plane and not scene.instruments
-    return at_rest(material.relaxation, scene.plan.options, vector)
+    vector = plan.second_plane or not plan.mechanics.hangs_on_rings
+    return at_rest(material.relaxation, plan.options, vector and not scene.instruments)
 
 
 def samples_of(

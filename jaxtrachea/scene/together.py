@@ -129,13 +129,8 @@ def press_together(
         rings |= {"end_U": does.lines.U, "end_V": does.lines.V}
     vectors = {"force": along(force), "depth": along(depth), "skeleton": does.skeleton}
     if pull is not None:
-
-        def felt(s, phi):
-            return _felt(scene, _influence(scene, safe, s, phi).compliance)
-
-        solution = Contacts(s, phi, force, depth)
-        each_way: Any = list(zip(paths, made, strict=True))
-        vectors |= forces_by_poses(scene, safe, solution, felt, each_way, pull)
+        ways: Any = list(zip(paths, made, strict=True))
+        vectors |= _by_poses(scene, safe, Contacts(s, phi, force, depth), ways, pull)
         lost = ~jnp.isfinite(jnp.sum(vectors["force"] + vectors["moment"], axis=2))
         solved = jnp.where((solved == PressStatus.OK) & lost, PressStatus.NON_FINITE, solved)
     fields = mask_rows(hidden, vectors | rings)
@@ -189,6 +184,15 @@ def _influence(
         return influence_vector(scene.geometry, material, s, phi, **levels)
     beam, half = ligament_beam(scene.geometry, material, scene.plan.options), _half(scene)
     return influence(beam, s) if half == 0 else level_influence(beam, s, half)
+
+
+def _by_poses(scene: Scene, material: Material, solved: Contacts, ways, pull: Pull):
+    """Force and moment of tools that wander, by what they feel of each other."""
+
+    def compliance(s, phi):
+        return _felt(scene, _influence(scene, material, s, phi).compliance)
+
+    return forces_by_poses(scene, material, solved, compliance, ways, pull)
 
 
 def _half(scene: Scene) -> float:
