@@ -110,18 +110,38 @@ def slide_path(
     above = jnp.zeros_like(displacement[0, 0]) if height is None else height
 
     def step(state, D):
-        slip, above = state
-        known = jnp.isfinite(jnp.sum(D))
-        given = jnp.where(known, D, 0)  # before what is derived from it
-        pressing = given[0] > 0
-        share = jnp.where(pressing, above / jnp.where(pressing, above + given[0], 1), 0)
-        out = slide(D, compliance, law, friction, slip + share * (given[1:] - slip))
-        solved = known & ((out.status == PressStatus.OK) | ~pressing)
-        slip = jnp.where(solved, out.slip, slip)
-        above = jnp.where(solved, jnp.where(pressing, 0, -given[0]), above)
-        return (slip, above), out._replace(slip=slip)
+        return land_and_slide(D, compliance, law, friction, *state)
 
     return jax.lax.scan(step, (start, above), displacement)[1]
+
+
+def land_and_slide(
+    displacement: Float[Array, "3"],
+    compliance: Float[Array, "3 3"],
+    law: Law,
+    friction: Coulomb,
+    slip: Float[Array, "2"],
+    above: Float[Array, ""],
+) -> tuple[tuple[Float[Array, "2"], Float[Array, ""]], Slide]:
+    """One step of `slide_path`, of a tool that stood `above` the surface: slip and height after it.
+
+    Args:
+        displacement: see `slide_path`.
+        compliance: see `slide_path`.
+        law: see `slide_path`.
+        friction: see `slide_path`.
+        slip: before the step, mm.
+        above: height before the step, mm; 0 in contact.
+    """
+    known = jnp.isfinite(jnp.sum(displacement))
+    given = jnp.where(known, displacement, 0)  # before what is derived from it
+    pressing = given[0] > 0
+    share = jnp.where(pressing, above / jnp.where(pressing, above + given[0], 1), 0)
+    out = slide(displacement, compliance, law, friction, slip + share * (given[1:] - slip))
+    solved = known & ((out.status == PressStatus.OK) | ~pressing)
+    slip = jnp.where(solved, out.slip, slip)
+    above = jnp.where(solved, jnp.where(pressing, 0, -given[0]), above)
+    return (slip, above), out._replace(slip=slip)
 
 
 def slide(
