@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import full_precision
+from jaxtrachea._numerics import full_precision, product
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
@@ -105,18 +105,22 @@ def on_one_point(
 ) -> Approach:
     """The path as presses on the place that the tool touches first, at or before row `first`."""
     rows, place = seen.gap.shape[0], landing(scene, path, seen, first)
-    D = place.way
+    D, inward = place.way, local_frame(place.phi)[0]
     if scene.plan.friction or scene.plan.options.contact == "bonded":
         # What goes on from row to row begins at first touch, where the way is 0. A pose that is no
         # number stays none.
-        D = jnp.where((jnp.arange(rows) >= first)[:, None] | jnp.isnan(D), D, 0)
+        waits = 0
+        if scene.plan.friction and scene.plan.tools != "one":  # others may lift the wall to it
+            away = product(D, inward) + jnp.maximum(seen.gap, 0)
+            waits = D - away[:, None] * inward[None]
+        D = jnp.where((jnp.arange(rows) >= first)[:, None] | jnp.isnan(D), D, waits)
 
     def spread(v):
         return jnp.broadcast_to(v, (rows, *v.shape))
 
     return Approach(
         seen=seen, presses=Presses(spread(place.s), spread(place.phi), D),
-        inward=spread(local_frame(place.phi)[0]), first=first,
+        inward=spread(inward), first=first,
         frame=None if place.frame is None else spread(place.frame), own=seen, inside=inside,
         landing=place,
     )  # fmt: skip

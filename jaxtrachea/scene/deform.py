@@ -63,7 +63,8 @@ def deform(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach
         if pose is None or scene.tool is None:
             return dented
         near = jnp.sum((straight - dent.centres[:1]) ** 2, axis=1)
-        return trail.touching(scene.tool, pose, near, place(mesh, u), dented)
+        sunk = place(mesh, u)
+        return sunk + trail.scale_to_touch(scene.tool, pose, near, sunk, dented) * (dented - sunk)
 
     moved = moved._replace(force=None, loads=None, dissipated=None, status=None)
     led = path if slides and made is not None else None

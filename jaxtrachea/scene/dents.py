@@ -31,6 +31,7 @@ class Dents(eqx.Module):
     Attributes:
         centres: mm; shape (n, 3).
         reach: of all of them, mm.
+        radii: distance of the contacts from the centreline, mm; (m,).
         sags: how far each tool lies over every centre where it just touches, mm; None: presses at
             points, whose tool is not known.
         peaks: share of each contact's indentation at every centre, where the tool is not known.
@@ -42,6 +43,7 @@ class Dents(eqx.Module):
 
     centres: Float[Array, "n 3"]
     reach: Float[Array, ""]
+    radii: Float[Array, " m"]
     sags: Float[Array, "m n"] | None
     peaks: Float[Array, "m n"]
     beside: Float[Array, "m n"]
@@ -86,7 +88,8 @@ def lay_out(
 
     own = np.repeat(np.eye(m, dtype=bool), count, axis=1)
     return Dents(
-        centres, local.REACH * jnp.max(jnp.stack(spacing)), sags, close(1.0), close(0.5),
+        centres, local.REACH * jnp.max(jnp.stack(spacing)), jnp.stack(radii), sags,
+        close(1.0), close(0.5),
         own, np.tile(np.arange(count) == 0, m), own & np.tile(local.pattern(count)[1], m),
     )  # fmt: skip
 
@@ -99,7 +102,8 @@ def fit(
     Args:
         dents: from `lay_out`.
         depth: local indentation of each contact, inwards, mm; 0: it does not press.
-        inward: normal of each contact, along which its dent is; None: all are on the midline.
+        inward: way along which the dent of each contact is, per inward indentation: its normal, or
+            with friction inclined; None: all are on the midline.
     """
     m, n = dents.own.shape
     if dents.sags is None:

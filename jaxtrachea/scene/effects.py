@@ -58,7 +58,9 @@ def _friction(case: Case) -> Verdict:
     facts, options = case.facts, case.options
     fixed = case.levels["contact_point"] == "fixed"
     cannot = ""
-    if not facts.friction:
+    if not facts.friction and facts.tools > 1:
+        cannot = "not every tool has a coefficient; give each its tool.friction (0: it slides)"
+    elif not facts.friction:
         cannot = "the tool has no coefficient; give tool.friction"
     elif not fixed:
         cannot = (
@@ -115,11 +117,12 @@ def _rings(case: Case) -> Verdict:
 
 
 def _axial(case: Case) -> Verdict:
-    needed = case.prescribed and case.facts.along > 0 and case.facts.tools == 1
+    drags = case.facts.tools == 1 or case.levels["friction"] == "on"
+    needed = case.prescribed and case.facts.along > 0 and drags
     cannot = "" if EFFECTS["axial"].given(case.facts.known) else "EA_L is not given"
     reason = "the tool moves along the tube" if needed else "no motion along the tube"
-    if case.facts.tools > 1:
-        cannot = reason = "several tools slide on the wall: none moves it along the tube"
+    if not drags:
+        cannot = reason = "the tools slide on the wall: none moves it along the tube"
     if needed and cannot:
         reason = f"{cannot}; the skeleton does not stretch"
     return _switch(needed and not cannot, reason, cannot)
@@ -240,7 +243,8 @@ def _tools(case: Case) -> Verdict:
         why = "with coupling 'total' no force knows the skeleton: contacts do not feel one another"
         refused["coupled"] = why, "use coupling 'series'"
         return Verdict("apart", f"{count} tools; {why}", refused)
-    slide = "; they slide without friction" if case.levels["second_plane"] == "on" else ""
+    slides = case.levels["second_plane"] == "on" and case.levels["friction"] == "off"
+    slide = "; they slide without friction" if slides else ""
     reason = f"{count} tools: the forces of all move each of them{slide}"
     return Verdict("coupled", reason, refused)
 
@@ -267,15 +271,14 @@ def _no_company(case: Case) -> tuple[str, str] | None:
 
 
 def _no_lines(case: Case) -> tuple[str, str] | None:
-    """Why several tools cannot press as vectors, and the cure; None: they can, without friction."""
+    """Why several tools cannot press as vectors, and the cure; None: they can."""
     levels = case.levels
-    if levels["friction"] == "on":
-        return "friction is derived for one tool", "set friction 'off'"
-    if case.facts.drags and case.prescribed:
+    if case.facts.drags and case.prescribed and levels["friction"] == "off":
         return (
             "one of them moves along the wall by more than a twentieth of its way: what it drags "
-            "along needs friction, which is derived for one tool",
-            "press straight in, or set contact_point 'per_step' (frictionless)",
+            "along needs friction",
+            "give each tool its friction (0: it slides freely), press straight in, or set "
+            "contact_point 'per_step' (frictionless)",
         )
     if case.options.contact == "bonded":
         return (

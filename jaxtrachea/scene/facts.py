@@ -115,10 +115,11 @@ def facts_together(each: Sequence[SceneFacts]) -> SceneFacts:
             return min(low), max(high)
         return max(values)
 
-    whole = "angle", "several_points", "along", "across", "slip", "friction", "near"
+    whole = "angle", "several_points", "along", "across", "slip", "near"
     whole += "way_fixed", "way_per_step", "duration", "drags"
     changed = {name: joined(name) for name in whole}
-    return dataclasses.replace(each[0], tools=len(each), **changed)
+    rubs = all(facts.friction for facts in each)
+    return dataclasses.replace(each[0], tools=len(each), friction=rubs, **changed)
 
 
 def _largest(v) -> float:

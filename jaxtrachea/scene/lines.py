@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrachea._numerics import added, product_of_rows, scaled
+from jaxtrachea._numerics import added, product_of_rows
 from jaxtrachea.mechanics.influence import Influence
 from jaxtrachea.mechanics.influence_vector import VectorInfluence, by_all, own_contacts
 from jaxtrachea.surface import regions
@@ -25,6 +25,7 @@ class Lines(NamedTuple):
         slopes: rotation there; (rows, lines, rings, 2).
         U: of the rings' ends at -alpha; (rows, rings, 3).
         V: at +alpha.
+        clamps: of the ends A and B of the tube; (rows, 2, 3). None: they are held.
     """
 
     contacts: Float[Array, "rows lines places 3"]
@@ -33,6 +34,7 @@ class Lines(NamedTuple):
     slopes: Float[Array, "rows lines rings 2"]
     U: Float[Array, "rows rings 3"]
     V: Float[Array, "rows rings 3"]
+    clamps: Float[Array, "rows 2 3"] | None = None
 
 
 class Moved(NamedTuple):
@@ -56,12 +58,20 @@ def on_midline(unit: Influence, force: Float[Array, "rows m"], half: float) -> M
     return Moved(at, y, anterior(-loads), lines)
 
 
-def round_the_tube(unit: VectorInfluence, force: Float[Array, "rows m"]) -> Moved:
-    """Contacts anywhere on the rings."""
+def round_the_tube(
+    unit: VectorInfluence, force: Float[Array, "rows m *k"], *, end_motion: bool = False
+) -> Moved:
+    """Contacts anywhere on the rings; inward forces, or (inward, along, round the tube)."""
+    rows, m = force.shape[:2]
+    force = force.reshape(rows, m, -1)
+    flat = force.reshape(rows, -1)
     names = "contacts", "turns", "joints", "slopes", "end_U", "end_V"
-    lines = Lines(*(by_all(force, getattr(unit, name)) for name in names))
-    loads = scaled(force[..., None, None], unit.loads[None])
-    return Moved(by_all(force, own_contacts(unit)), lines.joints, loads, lines)
+    lines = Lines(*(by_all(flat, getattr(unit, name)) for name in names))
+    if end_motion:
+        lines = lines._replace(clamps=by_all(flat, unit.clamps))
+    each = unit.loads.reshape(m, force.shape[2], *unit.loads.shape[1:])
+    loads = added([force[:, :, k, None, None] * each[None, :, k] for k in range(each.shape[1])])
+    return Moved(by_all(flat, own_contacts(unit)), lines.joints, loads, lines)
 
 
 def anterior(v: Float[Array, "*n"]) -> Float[Array, "*n 3"]:
@@ -102,7 +112,7 @@ def interpolate(
     def line(i):
         keys = regions.clamped(
             places[order], lines.contacts[i][order], lines.joints[i], lines.U, lines.V,
-            lines.slopes[i], lines.turns[i][order],
+            lines.slopes[i], lines.turns[i][order], clamps=lines.clamps,
         )  # fmt: skip
         return regions.interpolate(binding, weights[i], keys, method=method)
 

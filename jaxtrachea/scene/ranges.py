@@ -51,11 +51,11 @@ def outside_plan(
 ) -> Bool[Array, " rows"] | None:
     """Rows that press and need an effect that is off.
 
-    Off the midline or oblique without vectors, along the tube without stretch (of several tools:
-    dragging the wall along), along the surface without friction, deep without a skeleton that
-    softens, elsewhere or too far for one contact point, near a surface without a dent; or anywhere
-    with a material that bends, shears, lets the ends move or has rings of their own where the plan
-    did not.
+    Off the midline or oblique without vectors, along the tube without stretch (of several tools
+    without friction: dragging the wall along), along the surface without friction, deep without a
+    skeleton that softens, elsewhere or too far for one contact point, near a surface without a
+    dent; or anywhere with a material that bends, shears, lets the ends move or has rings of their
+    own where the plan did not.
 
     Args:
         scene: -
@@ -73,7 +73,7 @@ def outside_plan(
     given = not plan.contact
     if not plan.second_plane:
         found.append(off_midline(presses.phi) | axial(motion) | lateral(motion))
-    elif plan.tools != "one":
+    elif plan.tools != "one" and not plan.friction:
         found.append(drags(motion))
     elif not plan.mechanics.follows_axial:
         found.append(axial(motion))

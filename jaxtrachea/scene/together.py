@@ -12,19 +12,20 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import full_precision, product_of_rows, scaled
+from jaxtrachea._numerics import added, full_precision, product_of_rows, scaled
 from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.contacts_in_time import solve_in_time
+from jaxtrachea.mechanics.friction import Slide
 from jaxtrachea.mechanics.influence import Influence, influence, level_influence
-from jaxtrachea.mechanics.influence_vector import VectorInfluence, influence_vector
+from jaxtrachea.mechanics.influence_vector import VectorInfluence
 from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
 from jaxtrachea.mechanics.press import Contact, ligament_beam, local_law, respond
 from jaxtrachea.mechanics.press_history import History, Samples
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene import dents, lines
+from jaxtrachea.scene import dents, lines, trail
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.configurational import Contacts, forces_by_poses
 from jaxtrachea.scene.in_time import Before, samples_of
@@ -32,6 +33,7 @@ from jaxtrachea.scene.instruments import Pull, scene_of
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
+from jaxtrachea.scene.rub_together import Rubbed, influence_of, rub_paths
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local
@@ -45,20 +47,44 @@ class Together(NamedTuple):
     Attributes:
         s: places of the contacts; shape (m,).
         phi: their angles; (m,).
-        depth: local indentation; (rows, m).
+        depth: local indentation, inwards; (rows, m).
+        inward: way of the dents per indentation, of all rows or row by row; None: on the midline.
+        slip: way each tool has slid; None: no friction.
         lines: motion of the lines of joints.
         made: the way of each tool; None: presses.
         paths: of the tools, as read.
-        hidden: rows that were refused; (rows,).
+        hidden: rows that were refused, or have no solution; (rows,).
     """
 
     s: Float[Array, " m"]
     phi: Float[Array, " m"]
     depth: Float[Array, "rows m"]
+    inward: Float[Array, "*rows m 3"] | None
+    slip: Float[Array, "rows m 3"] | None
     lines: lines.Lines
     made: list[Approach | None]
     paths: Sequence[Poses | Presses]
     hidden: Bool[Array, " rows"]
+
+
+class _Solved(NamedTuple):
+    """Contacts in balance, in the directions of each: inwards, or (inward, along, round the tube).
+
+    Attributes:
+        unit: what unit forces in these directions move.
+        depth: local indentation, mm.
+        force: N.
+        load: elastic force, which the shape follows.
+        status: a `PressStatus`.
+        history: what a force that relaxes remembers after the last row.
+    """
+
+    unit: Influence | VectorInfluence
+    depth: Float[Array, "rows m *k"]
+    force: Float[Array, "rows m *k"]
+    load: Float[Array, "rows m *k"]
+    status: Int[Array, "rows m"]
+    history: History | None = None
 
 
 def views(scene: Scene) -> list[Scene]:
@@ -75,6 +101,7 @@ def press_together(
     present: Bool[Array, "rows m"] | None = None,
     before: Before | None = None,
     pull: Pull | None = None,
+    rubbed: Rubbed | None = None,
 ) -> tuple[dict[str, Any], Together, History | None]:
     """Fields of a `Simulation` but the surface, what that follows from, and what is remembered.
 
@@ -88,9 +115,11 @@ def press_together(
         present: tools that are there; None: all, and those that are glued from first touch on.
         before: of a force that relaxes; else None.
         pull: of a single row of tools that wander, see `configurational.forces_by_poses`.
+        rubbed: what tools with friction do, if it is known; else they follow their paths.
     """
     each = views(scene)
-    safe, bad = without_negative_values(scene, long_run(material))
+    checked = [without_negative_values(view, long_run(material)) for view in each]
+    safe, bad = checked[0][0], functools.reduce(jnp.logical_or, (bad for _, bad in checked))
     given = [path if isinstance(path, Presses) else None for path in paths]
     found = [refuse(v, safe, p, m, bad) for v, p, m in zip(each, given, made, strict=True)]
     refused = {
@@ -105,40 +134,33 @@ def press_together(
     hidden = functools.reduce(jnp.logical_or, refused.values())
     presses, used = [p for p, *_ in found], [u for _, u, *_ in found]
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
-    # Along their own normals: a tool that waits behind the tube is computed as one in front.
-    D = jnp.stack([jnp.sum(p.displacement * n, axis=1) for p, _, n, _ in found], axis=1)
-    D = jnp.where(hidden[:, None], 0, D)
-    unit = _influence(scene, safe, s, phi)
-    if present is None and scene.plan.options.contact == "bonded":
-        present = _touched(made, D)
-    depth, force, load, solved, history = _forces(scene, safe, s, unit, D, present, samples)
-    if scene.plan.options.coupling == "total":
-        alone = 0 if samples is None else depth
-        depth = jnp.where(force == 0, alone, D - product_of_rows(load, unit.compliance))
-    # The shape follows the elastic force, what rings bear the force.
-    if isinstance(unit, Influence):
-        does, bears = (lines.on_midline(unit, v, _half(scene)) for v in (load, force))
-        along = lambda v: lines.anterior(-v)  # noqa: E731
+    if scene.plan.friction:
+        if rubbed is None:
+            rubbed = rub_paths(scene, safe, s, phi, presses, hidden)
+        slid = rubbed.slid
+        solved = _Solved(rubbed.unit, slid.depth, slid.force, slid.force, slid.status)
     else:
-        does, bears = (lines.round_the_tube(unit, v) for v in (load, force))
-        normals = jax.vmap(local_frame)(phi)[:, 0]
-        along = functools.partial(_along, normals)
-    moved = Together(s, phi, depth, does.lines, list(made), paths, hidden)
-    rings = {"joints": does.joints, "loads": bears.loads} if scene.plan.joints else {}
-    if scene.plan.ring_ends:
-        rings |= {"end_U": does.lines.U, "end_V": does.lines.V}
-    vectors = {"force": along(force), "depth": along(depth), "skeleton": does.skeleton}
+        # Along their own normals: a tool that waits behind the tube is computed as one in front.
+        D = jnp.stack([jnp.sum(p.displacement * n, axis=1) for p, _, n, _ in found], axis=1)
+        D = jnp.where(hidden[:, None], 0, D)
+        if present is None and scene.plan.options.contact == "bonded":
+            present = _touched(made, D)
+        slid, solved = None, _forces(scene, safe, s, phi, D, present, samples)
+    vectors, rings, seen = _motion(scene, s, phi, solved, slid)
+    moved = Together(s, phi, *seen, made=list(made), paths=paths, hidden=hidden)
+    status = solved.status
     if pull is not None:
         ways: Any = list(zip(paths, made, strict=True))
-        vectors |= _by_poses(scene, safe, Contacts(s, phi, force, depth), ways, pull)
+        row = Contacts(s, phi, solved.force, solved.depth)
+        vectors |= _by_poses(scene, safe, row, ways, pull)
         lost = ~jnp.isfinite(jnp.sum(vectors["force"] + vectors["moment"], axis=2))
-        solved = jnp.where((solved == PressStatus.OK) & lost, PressStatus.NON_FINITE, solved)
+        status = jnp.where((status == PressStatus.OK) & lost, PressStatus.NON_FINITE, status)
     fields = mask_rows(hidden, vectors | rings)
     share = [
         depth_share(v, fields["depth"][:, j], fields["skeleton"][:, j], found[j][2])
         for j, v in enumerate(each)
     ]
-    status = [status_of(solved[:, j], share[j], made[j], refused) for j in range(len(each))]
+    word = [status_of(status[:, j], share[j], made[j], refused) for j in range(len(each))]
     ways = [m for m in made if m is not None]
 
     def stack(values):
@@ -151,8 +173,8 @@ def press_together(
         "frame": stack([m.frame for m in ways if m.frame is not None]),
         "depth_share": stack(share),
         "contact_share": stack([contact_share(v, m.own) for v, m in zip(each, ways, strict=False)]),
-        "status": _in_space(each, paths, stack(status)),
-    }, moved, history  # fmt: skip
+        "status": _in_space(each, paths, stack(word)),
+    }, moved, solved.history  # fmt: skip
 
 
 def _in_space(each: list[Scene], paths: Sequence[Poses | Presses], status):
@@ -169,19 +191,49 @@ def _in_space(each: list[Scene], paths: Sequence[Poses | Presses], status):
     return jnp.where(plain & overlapping(tools, poses), word, status)
 
 
-def _along(normals: Float[Array, "m 3"], v: Float[Array, "rows m"]) -> Float[Array, "rows m 3"]:
-    """Vectors along the inward normals."""
-    return scaled(v[..., None], normals[None])
+def _motion(scene: Scene, s, phi, solved: _Solved, slid: Slide | None):
+    """What contacts do: vectors of each, what the skeleton does, and what the surface follows.
+
+    The shape follows the elastic force, what rings bear the force.
+
+    Returns:
+        Two mappings of fields of a `Simulation`, and those of `Together` from `depth` to `lines`.
+    """
+    unit, depth, inward, slip = solved.unit, solved.depth, None, None
+    if isinstance(unit, Influence):
+        does, bears = (lines.on_midline(unit, v, _half(scene)) for v in (solved.load, solved.force))
+        force, vector = (lines.anterior(-v) for v in (solved.force, depth))
+    else:
+        ends = scene.plan.end_motion
+        does = lines.round_the_tube(unit, solved.load, end_motion=ends)
+        bears = lines.round_the_tube(unit, solved.force)
+        frames = jax.vmap(local_frame)(phi)
+        inward = frames[:, 0]
+        if slid is None:
+            force, vector = (scaled(v[..., None], inward[None]) for v in (solved.force, depth))
+        else:
+            force, vector, slip = (
+                jnp.einsum("rmk,mkx->rmx", v, frames[:, -v.shape[2] :])
+                for v in (solved.force, depth, slid.slip)
+            )
+            depth = depth[..., 0]
+            pressed = depth[..., None] > 0
+            inward = jnp.where(pressed, vector / jnp.where(pressed, depth[..., None], 1), inward)
+    vectors = {"force": force, "depth": vector, "skeleton": does.skeleton}
+    if slid is not None:
+        vectors |= {"slip": slip, "dissipated": slid.dissipated}
+    rings = {"joints": does.joints, "loads": bears.loads} if scene.plan.joints else {}
+    if scene.plan.ring_ends:
+        rings |= {"end_U": does.lines.U, "end_V": does.lines.V}
+    return vectors, rings, (depth, inward, slip, does.lines)
 
 
 def _influence(
     scene: Scene, material: Material, s: Float[Array, " m"], phi: Float[Array, " m"]
 ) -> Influence | VectorInfluence:
     """What every contact moves, of points or of punches."""
-    plan = scene.plan
-    if plan.second_plane:
-        levels = {"rings": plan.rings, "shear": plan.options.shear}
-        return influence_vector(scene.geometry, material, s, phi, **levels)
+    if scene.plan.second_plane:
+        return influence_of(scene, material, s, phi)
     beam, half = ligament_beam(scene.geometry, material, scene.plan.options), _half(scene)
     return influence(beam, s) if half == 0 else level_influence(beam, s, half)
 
@@ -209,32 +261,39 @@ def _touched(made: Sequence[Approach | None], D) -> Bool[Array, "rows m"]:
     ], axis=1)  # fmt: skip
 
 
-def _forces(scene: Scene, material: Material, s, unit, D, present, samples: Samples | None):
-    """Of all contacts local indentations, forces, elastic forces, statuses; what is remembered."""
+def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Samples | None):
+    """All contacts in balance, without friction."""
     options = scene.plan.options
+    unit = _influence(scene, material, s, phi)
     law = jax.vmap(lambda at: local_law(scene.geometry, material, at, options))(s)
     width, C = None, unit.compliance
     if options.contact == "unilateral":
         width = jnp.asarray(options.onset_width, D.dtype)
-    coupled = scene.plan.tools == "coupled"
     if samples is not None:
         found = solve_in_time(D, _felt(scene, C), law, samples, width=width, present=present)
-        return found.depth, found.force, found.elastic, found.status, found.history
-    if coupled:
+        depth, force, load = found.depth, found.force, found.elastic
+        solved = _Solved(unit, depth, force, load, found.status, found.history)
+    elif scene.plan.tools == "coupled":
 
         def row(D, present):
             return solve(D, C, law, width=width, present=present)
 
         found = jax.vmap(row, (0, None if present is None else 0))(D, present)
         depth = found.depth if width is None else jnp.maximum(found.depth, 0)
-        return depth, found.force, found.force, found.status, None
-    D = D if present is None else jnp.where(present, D, 0)
+        solved = _Solved(unit, depth, found.force, found.force, found.status)
+    else:
+        there = D if present is None else jnp.where(present, D, 0)
 
-    def alone(D, compliance, law):
-        return respond(D, compliance, Contact(law, jnp.zeros_like(compliance)), options)
+        def alone(D, compliance, law):
+            return respond(D, compliance, Contact(law, jnp.zeros_like(compliance)), options)
 
-    found = jax.vmap(alone, (1, 0, 0), 1)(D, jnp.diag(C), law)
-    return found.depth, found.force, found.force, found.status, None
+        found = jax.vmap(alone, (1, 0, 0), 1)(there, jnp.diag(C), law)
+        solved = _Solved(unit, found.depth, found.force, found.force, found.status)
+    if options.coupling == "total":
+        rest = 0 if samples is None else solved.depth
+        depth = jnp.where(solved.force == 0, rest, D - product_of_rows(solved.load, C))
+        solved = solved._replace(depth=depth)
+    return solved
 
 
 def _felt(scene: Scene, C: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -255,17 +314,51 @@ def deform_together(scene: Scene, moved: Together) -> Float[Array, "rows vertice
     method, straight, runs = plan.surface, mesh.straight, scene.runs
     places = moved.s if half == 0 else jnp.concatenate([moved.s - half, moved.s + half])
     weights = lines.weigh(binding, moved.phi, moved.lines.joints.shape[1])
-    inward = jax.vmap(local_frame)(moved.phi)[:, 0] if plan.second_plane else None
-    laid = None
+    each, laid = views(scene), None
     if plan.dent:
-        laid = dents.lay_out(views(scene), moved.s, moved.phi, moved.paths, moved.made)
+        laid = dents.lay_out(each, moved.s, moved.phi, moved.paths, moved.made)
+    by_row = moved.inward is not None and moved.inward.ndim == 3
+    led = None
+    if plan.friction and all(isinstance(path, Poses) for path in moved.paths):
+        led = list(moved.paths)
 
     def one(row):
-        depth, of_row = row
+        depth, of_row, inward, slip, poses = row
         u = lines.interpolate(binding, weights, places, of_row, method)
-        if laid is not None and runs is not None:
-            for dent, s in zip(dents.fit(laid, depth, inward), moved.s, strict=True):
+        if laid is None or runs is None:
+            return place(mesh, u)
+        found = dents.fit(laid, depth, inward if by_row else moved.inward)
+        if slip is None:
+            for dent, s in zip(found, moved.s, strict=True):
                 u = local.add_correction(u, dent, straight, runs, s)
-        return place(mesh, u)
+            return place(mesh, u)
+        return _slid(scene, moved, laid, found, u, slip, poses)
 
-    return mask_rows(moved.hidden, one_by_one(one, (moved.depth, moved.lines)))
+    rows = moved.depth, moved.lines, moved.inward if by_row else None, moved.slip, led
+    return mask_rows(moved.hidden, one_by_one(one, rows))
+
+
+def _slid(scene: Scene, moved: Together, laid: dents.Dents, found, u, slip, poses):
+    """The surface of one row with the dents where the tools have slid to, see `trail`.
+
+    Each is scaled until the surface touches its tool, beside the dents of the others as they are.
+    """
+    mesh, runs, none = scene.mesh, scene.runs, jnp.zeros_like(u)
+    assert mesh is not None
+    assert runs is not None
+    own = []
+    for j, dent in enumerate(found):
+        s, phi = moved.s[j], moved.phi[j]
+        there, turned = trail.slid(s, phi, laid.radii[j], slip[j])
+        dent = trail.lay_at(dent, there - s, turned - phi)
+        own.append((dent, local.add_correction(none, dent, mesh.straight, runs, there)))
+    whole = u + added([v for _, v in own])
+    if poses is None:
+        return place(mesh, whole)
+    dented, scaled_up = place(mesh, whole), u
+    for view, pose, (dent, v) in zip(views(scene), poses, own, strict=True):
+        near = jnp.sum((mesh.straight - dent.centres[:1]) ** 2, axis=1)
+        assert view.tool is not None
+        scale = trail.scale_to_touch(view.tool, pose, near, place(mesh, whole - v), dented)
+        scaled_up = scaled_up + scale * v
+    return place(mesh, scaled_up)

@@ -54,17 +54,17 @@ def lay_at(dent: local.Dent, way: Float[Array, ""], turn: Float[Array, ""]) -> l
     return dataclasses.replace(dent, centres=jnp.stack([s + way, c * y - n * z, n * y + c * z], 1))
 
 
-def touching(
+def scale_to_touch(
     tool: Shape,
     pose: Poses,
     near: Float[Array, " vertices"],
     sunk: Float[Array, "vertices 3"],
     dented: Float[Array, "vertices 3"],
-) -> Float[Array, "vertices 3"]:
-    """The dented surface with its dent scaled (by 0 at least) until it touches the tool.
+) -> Float[Array, ""]:
+    """By how much the dent (dented - sunk) is to be scaled until the surface touches the tool.
 
-    By `MAX_SCALE` at most, so that the surface is continuous where the dent goes to 0: a tool that
-    lies further inside of the sunk surface than that stays in it.
+    By 0 at least and by `MAX_SCALE` at most, so that the surface is continuous where the dent goes
+    to 0: a tool that lies further inside of the sunk surface than that stays in it.
 
     Args:
         tool: -
@@ -96,8 +96,7 @@ def touching(
         needed = jnp.max(jnp.where(counts, needed, -jnp.inf))
         return jnp.where(jnp.isfinite(needed), jnp.maximum(needed, 0), scale)
 
-    scale = jnp.minimum(jax.lax.fori_loop(0, STEPS, newton, jnp.ones_like(peak)), MAX_SCALE)
-    return sunk + scale * (dented - sunk)
+    return jnp.minimum(jax.lax.fori_loop(0, STEPS, newton, jnp.ones_like(peak)), MAX_SCALE)
 
 
 def _distance(tool: Shape, point):

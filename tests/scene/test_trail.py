@@ -59,12 +59,22 @@ def plane(dtype=float):
     return tuple(jnp.asarray(v, dtype) for v in arrays)
 
 
+def touching(tool, pose, near, sunk, dented):
+    """The surface with its dent scaled."""
+    return sunk + trail.scale_to_touch(tool, pose, near, sunk, dented) * (dented - sunk)
+
+
+def touching(tool, pose, near, sunk, dented):
+    """The surface with its dent scaled."""
+    return sunk + trail.scale_to_touch(tool, pose, near, sunk, dented) * (dented - sunk)
+
+
 def test_the_scale_has_the_derivatives_of_finite_differences():
     """By the ball's height: 1 over the dent's share where it touches; and not at all above."""
 
     def depth(height):
         pose = Poses(jnp.eye(3), jnp.zeros(3).at[1].set(height))
-        return -jnp.min(trail.touching(TOOLS["ball"][0], pose, *plane())[:, 1])
+        return -jnp.min(touching(TOOLS["ball"][0], pose, *plane())[:, 1])
 
     both = jax.jit(jax.vmap(jax.value_and_grad(depth)))
     heights = np.array([3.7, 4.6, 5.2])
@@ -87,7 +97,7 @@ def test_a_dent_is_scaled_until_it_touches(name, dtype):
     places = jnp.asarray(np.stack([0 * reaches, height - reaches, 0 * reaches], 1), dtype)
     poses = Poses(jnp.broadcast_to(jnp.eye(3, dtype=dtype), (3, 3, 3)), places)
     # As a part of `simulate`, also where products of matrices are in less by default.
-    run = jax.jit(jax.vmap(full_precision(trail.touching), (None, 0, None, None, None)))
+    run = jax.jit(jax.vmap(full_precision(touching), (None, 0, None, None, None)))
     surfaces = run(tool, poses, square, flat, dented)
     assert surfaces.dtype == flat.dtype
     # The capsule's distance is that of its smoothed shape, up to log(2) / beta too small.
@@ -109,7 +119,7 @@ def test_the_surface_is_continuous_where_the_dent_goes_to_nothing():
     pose = Poses(jnp.eye(3), jnp.array([0, height - 0.3, 0]))
     peaks = np.array([0.2, 0.1, 0.05, 1e-2, 1e-6, 1e-12, 0])
     dents = jnp.asarray(np.asarray(flat) + (peaks / 0.7)[:, None, None] * np.asarray(dented - flat))
-    run = jax.jit(jax.vmap(trail.touching, (None, None, None, None, 0)))
+    run = jax.jit(jax.vmap(touching, (None, None, None, None, 0)))
     lowest = -np.asarray(run(tool, pose, square, flat, dents))[:, :, 1].min(axis=1)
     np.testing.assert_allclose(lowest[:2], 0.3, atol=1e-2)  # it touches, up to the edge of the dent
     np.testing.assert_allclose(lowest[2:], 5 * peaks[2:], rtol=1e-9)
