@@ -79,7 +79,8 @@ def _evaluate(closed: ClosedJaxpr, values):
 
 def _rewritten(parameter):
     """A parameter of an operation, its body and branches rewritten."""
-    branches = isinstance(parameter, tuple) and all(isinstance(v, ClosedJaxpr) for v in parameter)
+    # A plain tuple: the named one of a linear solver holds functions of another kind.
+    branches = type(parameter) is tuple and all(isinstance(v, ClosedJaxpr) for v in parameter)
     if branches:
         return tuple(map(written_out, parameter))
     return written_out(parameter) if isinstance(parameter, ClosedJaxpr) else parameter

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxtrachea.mechanics.press_history import History
-from jaxtrachea.scene.anchor import Instant, anchor_at, as_approach, first_contact
+from jaxtrachea.scene.anchor import Anchor, Instant, anchor_at, as_approach, first_contact
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.grip import Grip, grip, pick
 from jaxtrachea.scene.memory import recall
@@ -34,9 +34,7 @@ def hold(
         inside: it is in the lumen.
         at_rest: history of nothing, of a force that relaxes.
     """
-    hit = (here.seen.gap[0] < 0) & ~inside[0]
-    last = pick(state.started, state.last, here)
-    first = pick(hit, first_contact(scene, last, here), anchor_at(scene, here))
+    last, first, hit = touched(scene, state, here, inside)
     held = (rub if scene.plan.friction else grip)(scene, material, state, last, here, first, hit)
     rest, made = as_approach(scene, held.anchor, held.way, here, inside)
     after = dataclasses.replace(
@@ -48,3 +46,12 @@ def hold(
         kept = recall(scene, state.memory, at_rest, held.anchor, depth, held.touching)
         after = dataclasses.replace(after, memory=kept)
     return after, rest, made, held
+
+
+def touched(
+    scene: Scene, state: Any, here: Instant, inside: Bool[Array, "1"]
+) -> tuple[Instant, Anchor, Bool[Array, ""]]:
+    """The step before, the place of a first touch, and whether the tool touches from outside."""
+    hit = (here.seen.gap[0] < 0) & ~inside[0]
+    last = pick(state.started, state.last, here)
+    return last, pick(hit, first_contact(scene, last, here), anchor_at(scene, here)), hit

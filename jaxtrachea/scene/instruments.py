@@ -23,6 +23,11 @@ def scene_of(scene: Scene, instrument: Instrument) -> Scene:
     return dataclasses.replace(scene, instruments=(), **own)
 
 
+def views(scene: Scene) -> list[Scene]:
+    """The scene as each tool sees it."""
+    return [scene_of(scene, instrument) for instrument in scene.instruments]
+
+
 def paths_in_order(
     names: list[str], paths: Mapping[str, Presses | Poses]
 ) -> tuple[Presses | Poses, ...]:

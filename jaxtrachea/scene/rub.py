@@ -17,14 +17,15 @@ this work, so it is told as dissipated: what of friction is left to the elastic 
 `configurational`), and what a press that gives way loses.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import product
+from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb
-from jaxtrachea.mechanics.oblique import Place, slide_at
+from jaxtrachea.mechanics.oblique import slide_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import (
     MAX_MISMATCH,
@@ -55,11 +56,89 @@ def no_slip(dtype) -> Slip:
     return Slip(none[:2], none[:2], none[0], none, none)
 
 
+class Led(NamedTuple):
+    """A tool on its place before what slides is known.
+
+    Attributes:
+        anchor: the place.
+        held: the place with the point of the tool that the next step begins with.
+        way: of the press since it last slid, see `anchor.press_vector`.
+        before: that of the step before, on this place; as the press was then.
+        changed: the place is not that of the step before, or its press gives way.
+        slip: what it has slid before this step.
+        touching: -
+    """
+
+    anchor: Anchor
+    held: Anchor
+    way: Float[Array, "3"]
+    before: Float[Array, "3"]
+    changed: Bool[Array, ""]
+    slip: Slip
+    touching: Bool[Array, ""]
+
+
+class Answer(NamedTuple):
+    """What the wall answers to a tool that is led; vectors in the frame of the tube.
+
+    Attributes:
+        law: the local law at its place.
+        force: N.
+        depth: local indentation, mm.
+        skeleton: what the forces move the place, mm.
+        sunk: what the forces of the step before would, mm.
+        slid: along and round the tube, mm.
+        dissipated: by friction, N mm.
+    """
+
+    law: Law
+    force: Float[Array, "3"]
+    depth: Float[Array, "3"]
+    skeleton: Float[Array, "3"]
+    sunk: Float[Array, "3"]
+    slid: Float[Array, "2"]
+    dissipated: Float[Array, ""]
+
+
 def rub(
     scene: Scene, material: Material, state: Any, last: Instant, here: Instant, first: Anchor, hit
 ) -> Grip:
     """Stick or slide on the place; arguments as for `grip`."""
     assert scene.friction is not None
+    led = lead(scene, state, last, here, first, hit)
+    place = place_of(scene, material, led.anchor)
+    assert place is not None, "friction has a second plane"
+    way = product(local_frame(led.anchor.phi).T, led.way)
+    path, slid = slide_at(place, way, Coulomb(scene.friction), scene.plan.oblique)
+    sunk = product(place.unit.compliance, led.slip.force)
+    press = path.press
+    answer = Answer(
+        place.law, press.force[0], press.depth[0], press.skeleton[0], sunk, slid,
+        path.dissipated[0],
+    )  # fmt: skip
+    after, total, lost = let_go(scene, led, answer, here)
+    along = local_frame(led.anchor.phi)[1:]
+
+    def solve(presses: Presses) -> Moved:
+        refused = jnp.isnan(jnp.sum(presses.displacement, axis=1))
+        moved = moved_by(press, scene.plan)
+        slip = product(total.held, along)[None]
+        numbers = moved._replace(slip=slip, dissipated=lost[None], status=None)
+        return mask_rows(refused, numbers)._replace(status=moved.status)
+
+    return Grip(
+        anchor=led.anchor,
+        after=after,
+        touching=hit,
+        way=whole_way(led),
+        solve=solve,
+        slip=total,
+        total=product(total.held + total.before, along),
+    )
+
+
+def lead(scene: Scene, state: Any, last: Instant, here: Instant, first: Anchor, hit) -> Led:
+    """The place that the tool holds now, and its press; arguments as for `grip`."""
     depth, most = -here.seen.gap[0], SPACING_SHARE * half_spacing(scene)
     teleported = step_length(first, last, here) > scene.radius
     teleported = teleported | (state.touching & has_left(scene, state.anchor, last, here))
@@ -78,55 +157,50 @@ def rub(
     inward = inward + share * (depth - inward)
     way = jnp.concatenate([inward[None], led[1:]])
     slip = pick(on, _behind(scene, state, followed), no_slip(way.dtype))
-    slip = _within(slip, way[1:], most)
-    place = place_of(scene, material, anchor)
-    assert place is not None, "friction has a second plane"
-    frame = local_frame(anchor.phi)
-    coulomb = Coulomb(scene.friction)
-    path, slid = slide_at(place, product(frame.T, way), coulomb, scene.plan.oblique)
-    # The press before this step, on the place and with the depth that it has now.
-    before = press_vector(scene, anchor, last.path) + way - led
-    changed = on & (follows | (inward != led[0]))
-    given_up = jnp.where(changed, _energy_lost(state.slip, place, product(frame.T, before)), 0)
-    force, depth_C = path.press.force[0], path.press.depth[0]
-    stored = _energy(place, force, depth_C)
-    total = slip._replace(held=slip.held + slid, stored=stored, force=force, depth=depth_C)
-    nothing = jnp.zeros(1, way.dtype)
-    held = anchor._replace(body=anchor.body + share * rolled)
-
-    def solve(presses: Presses) -> Moved:
-        refused = jnp.isnan(jnp.sum(presses.displacement, axis=1))
-        moved = moved_by(path.press, scene.plan)
-        slip = product(total.held, frame[1:])[None]
-        numbers = moved._replace(slip=slip, dissipated=path.dissipated + given_up, status=None)
-        return mask_rows(refused, numbers)._replace(status=moved.status)
-
-    return Grip(
+    return Led(
         anchor=anchor,
-        after=re_anchor(scene, held, way - jnp.concatenate([nothing, slid]), here.path),
+        held=anchor._replace(body=anchor.body + share * rolled),
+        way=way,
+        before=press_vector(scene, anchor, last.path) + way - led,
+        changed=on & (follows | (inward != led[0])),
+        slip=_within(slip, way[1:], most),
         touching=hit,
-        way=way + jnp.concatenate([nothing, slip.held]),
-        solve=solve,
-        slip=total,
-        total=product(total.held + total.before, frame[1:]),
     )
 
 
-def _energy(place: Place, force: Float[Array, "3"], depth: Float[Array, "3"]):
-    """Elastic energy of a press, N mm: of the local law, and of the skeleton."""
-    yielding = jnp.sum(force * product(place.unit.compliance, force))
-    return place.law.energy(jnp.sum(depth * depth)) + yielding / 2
+def whole_way(led: Led) -> Float[Array, "3"]:
+    """The way since the tool touched this place, with what it has slid before, mm."""
+    return led.way + jnp.concatenate([jnp.zeros_like(led.way[:1]), led.slip.held])
 
 
-def _energy_lost(slip: Slip, place: Place, way: Float[Array, "3"]):
+def let_go(
+    scene: Scene, led: Led, answer: Answer, here: Instant
+) -> tuple[Anchor, Slip, Float[Array, ""]]:
+    """What the next step begins with, the slip so far, and the work that is lost, N mm."""
+    frame, none = local_frame(led.anchor.phi), jnp.zeros_like(led.way[:1])
+    lost = _energy_lost(led.slip, answer, product(frame.T, led.before))
+    stored = _energy(answer, answer.force, answer.depth, answer.skeleton)
+    total = led.slip._replace(
+        held=led.slip.held + answer.slid, stored=stored, force=answer.force, depth=answer.depth
+    )
+    way = led.way - jnp.concatenate([none, answer.slid])
+    after = re_anchor(scene, led.held, way, here.path)
+    return after, total, answer.dissipated + jnp.where(led.changed, lost, 0)
+
+
+def _energy(answer: Answer, force, depth, moved):
+    """Elastic energy of a press, N mm: of the local law, and of the skeleton that it moves."""
+    return answer.law.energy(jnp.sum(depth * depth)) + jnp.sum(force * moved) / 2
+
+
+def _energy_lost(slip: Slip, answer: Answer, way: Float[Array, "3"]):
     """What the press stored in the step before, and does not on this place, N mm.
 
     W(d) + F . (D - d) - F . C F / 2 is stationary in F and d, where it is the energy: so those of
     the step before give that of this place up to the square of the change.
     """
-    force, depth = slip.force, slip.depth
-    yielding = jnp.sum(force * product(place.unit.compliance, force))
-    there = _energy(place, force, depth) + jnp.sum(force * (way - depth)) - yielding
+    force, depth, moved = slip.force, slip.depth, answer.sunk
+    there = _energy(answer, force, depth, moved) + jnp.sum(force * (way - depth - moved))
     lost = slip.stored - there
     return jnp.where(jnp.isfinite(lost), lost, 0)
 

@@ -1,19 +1,33 @@
 """Friction of several tools: what each drags along, with the forces of all others."""
 
+import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import product_of_rows
-from jaxtrachea.mechanics.contacts_friction import slide_paths
+from jaxtrachea.mechanics.contacts_friction import Stand, slide_paths, slide_together
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb, Slide
-from jaxtrachea.mechanics.influence_vector import VectorInfluence, influence_vector
+from jaxtrachea.mechanics.influence_vector import (
+    VectorInfluence,
+    by_all,
+    influence_vector,
+    own_contacts,
+)
 from jaxtrachea.mechanics.press import indentation, local_law
 from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.scene.anchor import as_approach
+from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.grip import pick
+from jaxtrachea.scene.hold import touched
+from jaxtrachea.scene.instruments import views
+from jaxtrachea.scene.refusals import on_the_tube
+from jaxtrachea.scene.rows import Rows, enter
+from jaxtrachea.scene.rub import Answer, lead, let_go, whole_way
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
@@ -65,6 +79,73 @@ def rub_paths(
     D = jnp.stack([_in_its_frame(p, hidden) for p in presses], axis=1)
     D = jnp.where(hidden[:, None, None], jnp.nan, smooth_touch(scene, D))
     return Rubbed(unit, slide_paths(D, felt(scene, unit), law_of(scene, material, s), mu_of(scene)))
+
+
+def rub_once(
+    scene: Scene, unit: VectorInfluence, law: Law, way: Float[Array, "m 3"], present
+) -> Slide:
+    """One step of tools that have not slid yet; those that are not present do nothing."""
+    none, away = jnp.zeros_like(way), jnp.array([-1.0, 0.0, 0.0], way.dtype)
+    D = jnp.where(present[:, None], smooth_touch(scene, way), away)
+    there = present[:, None, None, None] & present[None, None, :, None]
+    C = jnp.where(there, felt(scene, unit), 0)
+    start = Stand(none[:, 1:], none[:, 0], none)
+    return slide_together(D, C, law, mu_of(scene), start)[1]
+
+
+def rub_step(
+    scene: Scene, material: Material, rows: Rows, present: Bool[Array, " m"]
+) -> tuple[Any, Approach, Rubbed, Float[Array, "m 3"]]:
+    """One step of all tools on the places that they hold.
+
+    A pose that is no number leaves the state of all.
+
+    Args:
+        scene: of several instruments with friction.
+        material: -
+        rows: the tools.
+        present: which of them are there.
+
+    Returns:
+        The next states, the ways on the places, what they do, and the slip of each since it
+        touched, mm.
+    """
+    first, known = views(scene)[0], jnp.all(rows.at.known)
+
+    def take(row):
+        view, here, _, inside = enter(first, row)
+        last, place, hit = touched(view, row.state, here, inside)
+        return lead(view, row.state, last, here, place, hit)
+
+    led = jax.lax.map(take, rows)
+    places = jax.vmap(lambda s, phi: on_the_tube(scene, s, phi)[:2])(led.anchor.s, led.anchor.phi)
+    frames = jax.vmap(local_frame)(led.anchor.phi)
+    unit, law = influence_of(scene, material, *places), law_of(scene, material, places[0])
+    way = jnp.where(known, led.way, jnp.nan)
+    slid = rub_once(scene, unit, law, way, present)
+    # In the frame of the tube, where the places have turned since the step before.
+    force, depth = (jnp.einsum("mk,mkx->mx", v, frames) for v in (slid.force, slid.depth))
+    earlier = jnp.einsum("mx,mkx->mk", led.slip.force, frames)
+    skeleton, sunk = (
+        by_all(v.reshape(1, -1), own_contacts(unit))[0] for v in (slid.force, earlier)
+    )
+    answers = Answer(law, force, depth, skeleton, sunk, slid.slip, slid.dissipated)
+
+    def leave(row):
+        row, led, answer = row
+        view, here, side, inside = enter(first, row)
+        after, total, lost = let_go(view, led, answer, here)
+        _, made = as_approach(view, led.anchor, whole_way(led), here, inside)
+        new = dataclasses.replace(
+            row.state, started=jnp.asarray(True), touching=led.touching, last=here, anchor=after,
+            slip=total, side=side,
+        )  # fmt: skip
+        return pick(known, new, row.state), made, total, lost
+
+    after, made, total, lost = jax.lax.map(leave, (rows, led, answers))
+    slid = slid._replace(slip=total.held, dissipated=lost)
+    whole = jnp.einsum("mk,mkx->mx", total.held + total.before, frames[:, 1:])
+    return after, made, Rubbed(unit, jax.tree.map(lambda v: v[None], slid)), whole
 
 
 def _in_its_frame(presses: Presses, hidden) -> Float[Array, "rows 3"]:

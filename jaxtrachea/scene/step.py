@@ -36,6 +36,7 @@ from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.one_row import Row
 from jaxtrachea.scene.plan import Plan
+from jaxtrachea.scene.rows import without_part
 from jaxtrachea.scene.rub import no_slip
 from jaxtrachea.scene.simulation import Pressed, Simulation, pressed
 from jaxtrachea.scene.stage import (
@@ -45,7 +46,7 @@ from jaxtrachea.scene.stage import (
     check_material,
     touch_tube,
 )
-from jaxtrachea.scene.step_together import move_tools, placed, without_part
+from jaxtrachea.scene.step_together import move_tools, placed
 from jaxtrachea.status import PressStatus
 
 #: Rises when the fields of a `State` or their meaning change.

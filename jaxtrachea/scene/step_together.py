@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -15,23 +14,18 @@ from jaxtrachea.mechanics.levels.choose import AnyMaterial
 from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene.anchor import Instant
 from jaxtrachea.scene.approach import Approach, on_its_own
 from jaxtrachea.scene.grip import pick
 from jaxtrachea.scene.hold import hold
 from jaxtrachea.scene.in_time import Before, resting
-from jaxtrachea.scene.instruments import touch_and_pull, touch_together
-from jaxtrachea.scene.lumen import Side, next_side, whereabouts
+from jaxtrachea.scene.instruments import touch_and_pull, touch_together, views
 from jaxtrachea.scene.memory import Memory
+from jaxtrachea.scene.rows import enter, rows_of
+from jaxtrachea.scene.rub_together import rub_step
 from jaxtrachea.scene.simulation import Simulation, as_simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
-from jaxtrachea.scene.together import Together, press_together, views
+from jaxtrachea.scene.together import Together, press_together
 from jaxtrachea.status import PressStatus
-
-
-def without_part(seen: Touch) -> Touch:
-    """A contact of any tool, of the fields that one of a single part has."""
-    return eqx.tree_at(lambda v: v.part, seen, None, is_leaf=lambda v: v is None)
 
 
 def placed(
@@ -103,7 +97,13 @@ def move_tools(
         seen, pull = touch_and_pull(scene, paths)
     else:
         seen, pull = touch_together(scene, paths), None
-    after, made, touching, known = _hold(scene, material, state, paths, seen, present, rest)
+    rubbed, total = None, None
+    if scene.plan.friction:
+        rows = rows_of(scene, state, paths, seen, present)
+        after, made, rubbed, total = rub_step(scene, long_run(material), rows, present)
+        touching, known = after.touching, rows.at.known
+    else:
+        after, made, touching, known = _hold(scene, material, state, paths, seen, present, rest)
     there = present & touching if scene.plan.options.contact == "bonded" else present
     ways = [jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)]
     memory, before = after.memory, None
@@ -111,12 +111,16 @@ def move_tools(
         # A history that is unknown for one is so for all.
         lost = memory.press.lost
         before = Before(memory.press._replace(lost=jnp.max(lost)), dt=dt)
-    found, moved, history = press_together(scene, material, paths, ways, there[None], before, pull)
+    found, moved, history = press_together(
+        scene, material, paths, ways, there[None], before, pull, rubbed
+    )
     if memory is not None:
         assert history is not None
         kept = history._replace(lost=jnp.broadcast_to(history.lost, lost.shape))
         after = dataclasses.replace(after, memory=memory._replace(press=kept))
     result = jax.tree.map(lambda v: v[0], as_simulation(found))
+    if total is not None:
+        result = result._replace(slip=jnp.where(jnp.isnan(result.slip), jnp.nan, total))
     why = jnp.where(back, PressStatus.BACK_IN_TIME, PressStatus.NON_FINITE)
     status = jnp.where(jnp.all(known), result.status, why.astype(result.status.dtype))
     after = dataclasses.replace(after, present=jnp.where(back, state.present, present))
@@ -132,21 +136,11 @@ def _hold(
     One that is not present counts as clear of the wall. How a tool holds its place does not depend
     on its shape: one program serves all.
     """
-    each = views(scene)
-    off = [
-        eqx.tree_at(lambda v: v.gap, without_part(v), jnp.where(there, v.gap, 1 + jnp.abs(v.gap)))
-        for v, there in zip(seen, present, strict=True)
-    ]
-    at = [whereabouts(*one) for one in zip(each, paths, off, strict=True)]
-    footprints = [view.footprint for view in each]
-    rows = jax.tree.map(lambda *v: jnp.stack(v), *zip(paths, off, at, footprints, strict=True))
+    each, rows = views(scene), rows_of(scene, state, paths, seen, present)
 
     def one(row):
-        old, (path, touch, at, footprint) = row
-        view = dataclasses.replace(each[0], footprint=footprint)
-        at = jax.tree.map(lambda v: v[0], at)
-        side = next_side(old.side, at)
-        inside, here = (side == Side.IN_LUMEN)[None], Instant(path, touch)
+        view, here, side, inside = enter(each[0], row)
+        old, (path, touch), at = row.state, here, row.at
         if view.plan.contact_point == "per_step":
             made = on_its_own(view, path, touch)._replace(inside=inside)
             new = pick(at.known, dataclasses.replace(old, side=side), old)
@@ -157,7 +151,7 @@ def _hold(
         new = pick(at.known, dataclasses.replace(new, side=side), old)
         return new, made, held.touching, at.known
 
-    return jax.lax.map(one, (state, rows))
+    return jax.lax.map(one, rows)
 
 
 def _where_pressed(made: Approach, memory: Memory, touching: Bool[Array, ""]) -> Approach:

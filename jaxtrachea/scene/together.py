@@ -29,7 +29,7 @@ from jaxtrachea.scene import dents, lines, trail
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.configurational import Contacts, forces_by_poses
 from jaxtrachea.scene.in_time import Before, samples_of
-from jaxtrachea.scene.instruments import Pull, scene_of
+from jaxtrachea.scene.instruments import Pull, views
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
@@ -87,11 +87,6 @@ class _Solved(NamedTuple):
     history: History | None = None
 
 
-def views(scene: Scene) -> list[Scene]:
-    """The scene as each tool sees it."""
-    return [scene_of(scene, instrument) for instrument in scene.instruments]
-
-
 @full_precision
 def press_together(
     scene: Scene,
@@ -146,8 +141,8 @@ def press_together(
         if present is None and scene.plan.options.contact == "bonded":
             present = _touched(made, D)
         slid, solved = None, _forces(scene, safe, s, phi, D, present, samples)
-    vectors, rings, seen = _motion(scene, s, phi, solved, slid)
-    moved = Together(s, phi, *seen, made=list(made), paths=paths, hidden=hidden)
+    vectors, rings, followed = _motion(scene, s, phi, solved, slid)
+    moved = Together(s, phi, *followed, made=list(made), paths=paths, hidden=hidden)
     status = solved.status
     if pull is not None:
         ways: Any = list(zip(paths, made, strict=True))
