@@ -34,6 +34,8 @@ from .mechanics.press_contacts import Contacts as Contacts
 from .mechanics.press_contacts import press_contacts as press_contacts
 from .mechanics.press_contacts_oblique import ObliqueContacts as ObliqueContacts
 from .mechanics.press_contacts_oblique import press_contacts_oblique as press_contacts_oblique
+from .mechanics.press_contacts_path import ContactsPath as ContactsPath
+from .mechanics.press_contacts_path import press_contacts_path as press_contacts_path
 from .mechanics.press_in_time import press_in_time as press_in_time
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response

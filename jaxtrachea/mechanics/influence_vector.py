@@ -261,7 +261,7 @@ def _along(geometry: Geometry, material: Material, s, kappa, axial: bool):
         span = jnp.clip(jnp.searchsorted(bounds, s, side="right") - 1, 0, n)
         low, high = bounds[span], bounds[span + 1]
         nodes = jnp.concatenate([ends[:, :1], rings, ends[:, 1:]], 1)
-        share = (s - low) / (high - low)
+        share = ((s - low) / (high - low))[None]
         linear = nodes[:, span] * (1 - share) + nodes[:, span + 1] * share  # at place p by force j
         a, b = jnp.minimum(s[:, None], s[None]), jnp.maximum(s[:, None], s[None])
         between = (a - low[None]) * (high[None] - b) / ((high - low) * EA[span])[None]

@@ -119,11 +119,8 @@ def checked_contacts(
     Raises:
         ValueError: too many contacts, or arrays that do not fit their number.
     """
-    dtype = float_type(geometry)
-    s_c = shaped("s_c", s_c, ("any number of",), dtype=dtype)
-    m = s_c.shape[0]
-    if not 1 <= m <= MOST_CONTACTS:
-        raise ValueError(f"s_c has {m} contacts; expected 1 to {MOST_CONTACTS}")
+    s_c = checked_places(geometry, s_c)
+    m, dtype = s_c.shape[0], s_c.dtype
     displacement = last_axis("displacement", displacement, m, dtype)
     onset = shaped("onset", jnp.zeros_like(s_c) if onset is None else onset, (m,), dtype=dtype)
     there = jnp.asarray(True if present is None else present)
@@ -132,6 +129,18 @@ def checked_contacts(
             f"present has shape {there.shape} of {there.dtype}; expected ({m},) of True and False"
         )
     return Asked(s_c, displacement, onset, jnp.broadcast_to(there, (m,)))
+
+
+def checked_places(geometry: Geometry, s_c: ArrayLike) -> Float[Array, " m"]:
+    """Positions of several contacts as an array.
+
+    Raises:
+        ValueError: too many contacts, or none.
+    """
+    s_c = shaped("s_c", s_c, ("any number of",), dtype=float_type(geometry))
+    if not 1 <= s_c.shape[0] <= MOST_CONTACTS:
+        raise ValueError(f"s_c has {s_c.shape[0]} contacts; expected 1 to {MOST_CONTACTS}")
+    return s_c
 
 
 def check_contact_options(options: Options, name: str) -> None:

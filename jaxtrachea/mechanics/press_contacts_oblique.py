@@ -101,19 +101,18 @@ def press_contacts_oblique(
     """
     check_shapes(geometry, material)
     check_word("options", options, ObliqueOptions)
-    _check_oblique(options.press, options.rings)
+    check_off_midline(options.press, options.rings, "press_contacts_oblique")
     asked = checked_contacts(geometry, s_c, displacement, onset, present)
     phi_c = shaped("phi_c", phi_c, asked.s_c.shape, dtype=asked.s_c.dtype)
     return _press_contacts_oblique(geometry, material, options, phi_c, asked)
 
 
-def _check_oblique(options: Options, rings: Rings) -> None:
-    """Refuse what is not derived for several contacts off the midline.
+def check_off_midline(options: Options, rings: Rings, name: str) -> None:
+    """Refuse what the function of this name has not for several contacts off the midline.
 
     Raises:
         ValueError: naming the option and the cure.
     """
-    name = "press_contacts_oblique"
     check_contact_options(options, name)
     if options.contact == "bonded":
         raise ValueError(
@@ -138,13 +137,9 @@ def _press_contacts_oblique(
     """`press_contacts_oblique`, of arguments that are checked."""
     press, levels = options.press, {"rings": options.rings, "shear": options.press.shear}
     used = (*read_values(press), *skeleton.read_values(**levels, axial=False))
-    s_c = jnp.where(asked.present, asked.s_c, geometry.length / 2)
-    s_c, refused = jax.vmap(lambda s: validate(geometry, material, s, used)[1:])(s_c)
-    material = validate(geometry, material, s_c[0], used).material
-    on, at = on_ring(geometry.half_angle, phi_c)
-    why = jnp.where(jnp.isnan(phi_c), PressStatus.NON_FINITE, PressStatus.BEHIND_GAP)
-    on = on | ~asked.present | (refused != PressStatus.OK)
-    refused = jnp.max(jnp.where(on, refused, why)).astype(jnp.int8)
+    s_c, at, material, refused = places_of(
+        geometry, material, asked.s_c, phi_c, asked.present, used
+    )
     unit = influence_vector(geometry, material, s_c, at, **levels)
     law = jax.vmap(lambda s: local_law(geometry, material, s, press))(s_c)
     force, depth, status = solve_rows(asked, unit.compliance, law, press, geometry.radius)
@@ -167,3 +162,23 @@ def _press_contacts_oblique(
         compliance=unit.compliance,
         status=status_of(refused, status),
     )
+
+
+def places_of(geometry: Geometry, material: Material, s_c, phi_c, present, used: tuple[str, ...]):
+    """Places and material to compute with, and the refusal of all contacts, or OK.
+
+    Args:
+        geometry: -
+        material: -
+        s_c: positions, mm; shape (m,).
+        phi_c: angles, rad.
+        present: which contacts are there.
+        used: values of the material that are read.
+    """
+    s_c = jnp.where(present, s_c, geometry.length / 2)
+    s_c, refused = jax.vmap(lambda s: validate(geometry, material, s, used)[1:])(s_c)
+    material = validate(geometry, material, s_c[0], used).material
+    on, at = on_ring(geometry.half_angle, phi_c)
+    why = jnp.where(jnp.isnan(phi_c), PressStatus.NON_FINITE, PressStatus.BEHIND_GAP)
+    on = on | ~present | (refused != PressStatus.OK)
+    return s_c, at, material, jnp.max(jnp.where(on, refused, why)).astype(jnp.int8)

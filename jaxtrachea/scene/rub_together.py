@@ -18,7 +18,8 @@ from jaxtrachea.mechanics.influence_vector import (
     influence_vector,
     own_contacts,
 )
-from jaxtrachea.mechanics.press import indentation, local_law
+from jaxtrachea.mechanics.press import local_law
+from jaxtrachea.mechanics.press_contacts_path import smooth_touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.anchor import as_approach
 from jaxtrachea.scene.approach import Approach
@@ -65,8 +66,6 @@ def rub_paths(
 ) -> Rubbed:
     """Follow all tools side by side.
 
-    A row in which one has no solution has none for all: forces 0 (it is hidden), and its statuses.
-
     Args:
         scene: of several instruments with friction.
         material: values that are not negative.
@@ -77,7 +76,7 @@ def rub_paths(
     """
     unit = influence_of(scene, material, s, phi)
     D = jnp.stack([_in_its_frame(p, hidden) for p in presses], axis=1)
-    D = jnp.where(hidden[:, None, None], jnp.nan, smooth_touch(scene, D))
+    D = jnp.where(hidden[:, None, None], jnp.nan, smooth_touch(D, scene.plan.options))
     return Rubbed(unit, slide_paths(D, felt(scene, unit), law_of(scene, material, s), mu_of(scene)))
 
 
@@ -86,7 +85,7 @@ def rub_once(
 ) -> Slide:
     """One step of tools that have not slid yet; those that are not present do nothing."""
     none, away = jnp.zeros_like(way), jnp.array([-1.0, 0.0, 0.0], way.dtype)
-    D = jnp.where(present[:, None], smooth_touch(scene, way), away)
+    D = jnp.where(present[:, None], smooth_touch(way, scene.plan.options), away)
     there = present[:, None, None, None] & present[None, None, :, None]
     C = jnp.where(there, felt(scene, unit), 0)
     start = Stand(none[:, 1:], none[:, 0], none)
@@ -148,18 +147,21 @@ def rub_step(
     return after, made, Rubbed(unit, jax.tree.map(lambda v: v[None], slid)), whole
 
 
+def without_rows(slid: Slide, lost: Bool[Array, " rows"]) -> Slide:
+    """With zeros in rows without a solution: by 0 times NaN they would reach derivatives."""
+
+    def still(v):
+        off = lost.reshape(-1, *[1] * (v.ndim - 1))
+        return jnp.where(off, jnp.zeros_like(v), v)
+
+    return jax.tree.map(still, slid._replace(status=None))._replace(status=slid.status)
+
+
 def _in_its_frame(presses: Presses, hidden) -> Float[Array, "rows 3"]:
     """Displacements inwards, along and round the tube where the tool is, behind it or not."""
     D = jnp.where(hidden[:, None], 0, presses.displacement)
     phi = presses.phi[0]
     return product_of_rows(D, local_frame(jnp.where(jnp.isnan(phi), 0, phi)).T)
-
-
-def smooth_touch(scene: Scene, D: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """The displacements, with the smooth first touch that one tool by itself has."""
-    inward, onset = D[..., 0], jnp.zeros((), D.dtype)
-    inward = jnp.where(inward < 0, inward, indentation(inward, onset, scene.plan.options))
-    return jnp.concatenate([inward[..., None], D[..., 1:]], -1)
 
 
 def law_of(scene: Scene, material: Material, s: Float[Array, " m"]) -> Law:

@@ -33,7 +33,7 @@ from jaxtrachea.scene.instruments import Pull, views
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
-from jaxtrachea.scene.rub_together import Rubbed, influence_of, rub_paths
+from jaxtrachea.scene.rub_together import Rubbed, influence_of, rub_paths, without_rows
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local
@@ -132,7 +132,8 @@ def press_together(
     if scene.plan.friction:
         if rubbed is None:
             rubbed = rub_paths(scene, safe, s, phi, presses, hidden)
-        slid = rubbed.slid
+        lost = jnp.isnan(jnp.sum(rubbed.slid.force, axis=(1, 2)))
+        slid, hidden = without_rows(rubbed.slid, lost), hidden | lost
         solved = _Solved(rubbed.unit, slid.depth, slid.force, slid.force, slid.status)
     else:
         # Along their own normals: a tool that waits behind the tube is computed as one in front.
@@ -186,7 +187,9 @@ def _in_space(each: list[Scene], paths: Sequence[Poses | Presses], status):
     return jnp.where(plain & overlapping(tools, poses), word, status)
 
 
-def _motion(scene: Scene, s, phi, solved: _Solved, slid: Slide | None):
+def _motion(
+    scene: Scene, s, phi, solved: _Solved, slid: Slide | None
+) -> tuple[dict[str, Any], dict[str, Any], tuple]:
     """What contacts do: vectors of each, what the skeleton does, and what the surface follows.
 
     The shape follows the elastic force, what rings bear the force.
@@ -213,7 +216,7 @@ def _motion(scene: Scene, s, phi, solved: _Solved, slid: Slide | None):
             )
             depth = depth[..., 0]
             pressed = depth[..., None] > 0
-            inward = jnp.where(pressed, vector / jnp.where(pressed, depth[..., None], 1), inward)
+            inward = jnp.where(pressed, vector / jnp.where(pressed, depth[..., None], 1), inward[None])
     vectors = {"force": force, "depth": vector, "skeleton": does.skeleton}
     if slid is not None:
         vectors |= {"slip": slip, "dissipated": slid.dissipated}

@@ -64,11 +64,6 @@ def touching(tool, pose, near, sunk, dented):
     return sunk + trail.scale_to_touch(tool, pose, near, sunk, dented) * (dented - sunk)
 
 
-def touching(tool, pose, near, sunk, dented):
-    """The surface with its dent scaled."""
-    return sunk + trail.scale_to_touch(tool, pose, near, sunk, dented) * (dented - sunk)
-
-
 def test_the_scale_has_the_derivatives_of_finite_differences():
     """By the ball's height: 1 over the dent's share where it touches; and not at all above."""
 
