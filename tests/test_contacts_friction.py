@@ -118,8 +118,9 @@ def test_without_friction_it_is_the_balance_of_normal_forces():
     found = follow(D, C, k_1, k_3, np.zeros(4))
     normal, law = jnp.asarray(C[:, 0, :, 0]), Law(*map(jnp.asarray, (k_1, k_3)))
     run = jax.jit(lambda D: solve(D, normal, law, width=jnp.asarray(1e-12)))
-    for step, row in zip(found.force, D, strict=True):
-        np.testing.assert_allclose(step[:, 0], run(jnp.asarray(row[:, 0])).force, rtol=0, atol=1e-10)
+    for force, way in zip(found.force, D, strict=True):
+        true = run(jnp.asarray(way[:, 0])).force
+        np.testing.assert_allclose(force[:, 0], true, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(found.force[..., 1:], 0)
 
 

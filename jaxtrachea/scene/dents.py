@@ -102,8 +102,8 @@ def fit(
     Args:
         dents: from `lay_out`.
         depth: local indentation of each contact, inwards, mm; 0: it does not press.
-        inward: way along which the dent of each contact is, per inward indentation: its normal, or
-            with friction inclined; None: all are on the midline.
+        inward: direction of the dent of each contact: its normal, or with friction inclined; None:
+            all are on the midline.
     """
     m, n = dents.own.shape
     if dents.sags is None:

@@ -47,8 +47,8 @@ class Together(NamedTuple):
     Attributes:
         s: places of the contacts; shape (m,).
         phi: their angles; (m,).
-        depth: local indentation, inwards; (rows, m).
-        inward: way of the dents per indentation, of all rows or row by row; None: on the midline.
+        depth: local indentation; (rows, m).
+        inward: its direction, of all rows, or with friction row by row; None: on the midline.
         slip: way each tool has slid; None: no friction.
         lines: motion of the lines of joints.
         made: the way of each tool; None: presses.
@@ -214,9 +214,10 @@ def _motion(
                 jnp.einsum("rmk,mkx->rmx", v, frames[:, -v.shape[2] :])
                 for v in (solved.force, depth, slid.slip)
             )
-            depth = depth[..., 0]
-            pressed = depth[..., None] > 0
-            inward = jnp.where(pressed, vector / jnp.where(pressed, depth[..., None], 1), inward[None])
+            square = jnp.sum(depth * depth, axis=-1)
+            depth = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+            deep = depth[..., None]
+            inward = jnp.where(deep > 0, vector / jnp.where(deep > 0, deep, 1), inward[None])
     vectors = {"force": force, "depth": vector, "skeleton": does.skeleton}
     if slid is not None:
         vectors |= {"slip": slip, "dissipated": slid.dissipated}

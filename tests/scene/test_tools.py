@@ -546,7 +546,7 @@ def test_what_does_not_go_together():
         ({"angle": 0.5, "known": frozenset({"EI_C", "k_t"})}, {"rings": "arch"}, "use 'arch2'"),
         ({"angle": 0.5, "drags": True}, {}, "press straight in"),
         ({"angle": 0.5, "known": frozenset({"EA_L"})}, {"axial": "on"}, "slide on the wall"),
-        ({"slip": 1.0, "along": 0.5, "friction": True}, {}, "set friction 'off'"),
+        ({"slip": 1.0, "along": 0.5}, {"friction": "on"}, "not every tool has a coefficient"),
         ({"known": frozenset({"sections"})}, {"contact": "bonded"}, r"give \[material\] in"),
         ({"known": frozenset({"relaxation", "relaxation.skeleton"}), "timed": True}, {},
          "set relaxation 'uniform' or 'off'"),
