@@ -11,7 +11,6 @@ from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import scaled
 from jaxtrachea.mechanics import skeleton
 from jaxtrachea.mechanics.influence_vector import by_all, influence_vector, own_contacts
-from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import local_law, read_values
 from jaxtrachea.mechanics.press_contacts import (
@@ -21,7 +20,7 @@ from jaxtrachea.mechanics.press_contacts import (
     solve_rows,
 )
 from jaxtrachea.mechanics.ring import on_ring
-from jaxtrachea.mechanics.skeleton import Rings, local_frame
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.mechanics.validation import check_shapes, mask, status_of, validate
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -101,25 +100,25 @@ def press_contacts_oblique(
     """
     check_shapes(geometry, material)
     check_word("options", options, ObliqueOptions)
-    check_off_midline(options.press, options.rings, "press_contacts_oblique")
+    check_off_midline(options, "press_contacts_oblique")
     asked = checked_contacts(geometry, s_c, displacement, onset, present)
     phi_c = shaped("phi_c", phi_c, asked.s_c.shape, dtype=asked.s_c.dtype)
     return _press_contacts_oblique(geometry, material, options, phi_c, asked)
 
 
-def check_off_midline(options: Options, rings: Rings, name: str) -> None:
+def check_off_midline(options: ObliqueOptions, name: str) -> None:
     """Refuse what the function of this name has not for several contacts off the midline.
 
     Raises:
         ValueError: naming the option and the cure.
     """
-    check_contact_options(options, name)
-    if options.contact == "bonded":
+    check_contact_options(options.press, name)
+    if options.press.contact == "bonded":
         raise ValueError(
             f"{name} needs contact='unilateral', found 'bonded': a tool that is glued holds the "
             "wall along the surface, too; press by `press_oblique`"
         )
-    if rings == "arch":
+    if options.rings == "arch":
         raise ValueError(
             f"{name} needs rings='arch2' or 'mat', found 'arch': it has no motion of a ring at one "
             "angle by a load at another"

@@ -95,7 +95,7 @@ def press_contacts_path(
     check_shapes(geometry, material)
     check_word("options", options, ObliqueOptions)
     check_word("friction", friction, Coulomb)
-    check_off_midline(options.press, options.rings, "press_contacts_path")
+    check_off_midline(options, "press_contacts_path")
     s_c = checked_places(geometry, s_c)
     m, dtype = s_c.shape[0], s_c.dtype
     phi_c = shaped("phi_c", phi_c, (m,), dtype=dtype)

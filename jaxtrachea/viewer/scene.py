@@ -55,10 +55,10 @@ class Handled(NamedTuple):
 def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> Handled:
     """Read a scene file for tools that go anywhere.
 
-    The second plane is on, and axial motion of a single tool where `EA_L` is given. The contact
-    point is `per_step` without friction, so that the force depends on the pose alone. With a
-    coefficient of friction, of a bonded tool, and where the force relaxes, it is `fixed`, as
-    docs/haptics.md has it.
+    The second plane is on, and axial motion where `EA_L` is given (of several tools: with
+    friction). The contact point is `per_step` without friction, so that the force depends on the
+    pose alone. With a coefficient of friction, of a bonded tool, and where the force relaxes, it is
+    `fixed`, as docs/haptics.md has it.
 
     Args:
         path: of the scene (TOML).
@@ -104,12 +104,14 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
         glued = False
         notes.append("contact: unilateral, since a finger is not glued to the wall")
     rubs = _rubs(spec)
-    if rubs and (relaxes or spec.names):
+    tools = spec.tool if isinstance(spec.tool, list) else [spec.tool]
+    bare = any(tool is None or tool.friction is None for tool in tools)
+    if rubs and (relaxes or bare):
         rubs = False
-        why = "the force relaxes" if relaxes else "several tools slide without"
+        why = "the force relaxes" if relaxes else "not every tool has a coefficient"
         notes.append(f"no friction, since {why}")
     changes["contact_point"] = "fixed" if glued or rubs or relaxes else "per_step"
-    if spec.names:
+    if spec.names and not rubs:
         changes["axial"] = "off"
     changes["friction"] = "on" if rubs else "off"
     return spec.model_copy(
@@ -142,7 +144,7 @@ def _far_away(names: Sequence[str], times: Sequence[float]) -> list[PathSection]
 
 
 def _rubs(spec: SceneSpec) -> bool:
-    """Whether a tool of this scene sticks and slides by Coulomb's law."""
+    """Whether a tool of this scene is to stick and slide by Coulomb's law."""
     tools = spec.tool if isinstance(spec.tool, list) else [spec.tool]
     known = any(tool is not None and tool.friction is not None for tool in tools)
     wished = spec.effects.friction != "off" and spec.effects.contact_point != "per_step"
