@@ -241,6 +241,25 @@ def test_neighbours_lift_the_wall_off_a_third():
     np.testing.assert_allclose(balance, 0, atol=1e-14)
 
 
+def test_a_glued_tool_beside_others():
+    """Linear laws: those that touch and the glued one, which pulls, are springs in series."""
+    values, glued = VALUES | {"k_3": 0.0, "k_5": 0.0}, np.array([False, False, True, False])
+    program = jax.jit(press_contacts, static_argnames="options")
+    run = functools.partial(program, table_1(), Material(**values), S)
+    rows = np.stack([NEAR, [3.0, 3.0, -2.0, -8.0]])
+    found = jax.device_get(run(rows, bonded=glued))
+    np.testing.assert_array_equal(found.status, [[OK] * 4, [OK, OK, OK, NO_CONTACT]])
+    assert (found.force[:, 2] < 0).all()  # the wall is drawn up to it
+    for force, D, touch in zip(found.force, rows, (slice(0, 4), slice(0, 3)), strict=True):
+        series = found.compliance[touch, touch] + np.eye(4)[touch, touch] / values["k_1"]
+        true = np.linalg.solve(series, D[touch])
+        # Within the smooth first touch a deep press lacks its mean.
+        np.testing.assert_allclose(force[touch], true, rtol=0, atol=1e-12)
+    every = jax.device_get(run(rows, options=Options(contact="bonded")))
+    all_glued = jax.device_get(run(rows, bonded=np.ones(4, bool)))
+    np.testing.assert_allclose(all_glued.force, every.force, rtol=0, atol=1e-14)
+
+
 def test_onset_is_where_each_first_touches():
     onset = np.array([0.5, -0.25, 1.0, 2.0])
     found = pressed(S, NEAR + onset, VALUES, ALL, onset)
@@ -349,6 +368,8 @@ def test_too_many_and_what_does_not_fit():
             press_contacts(tube, material, *arguments)
     with pytest.raises(ValueError, match=r"present has shape \(3,\)"):
         press_contacts(tube, material, S, NEAR, present=np.ones(3, bool))
+    with pytest.raises(ValueError, match=r"bonded has shape \(4,\) of int64; expected \(4,\)"):
+        press_contacts(tube, material, S, NEAR, bonded=np.ones(4, int))
     with pytest.raises(ValueError, match="expected one for each contact|onset has 2 values"):
         press_contacts(tube, material, S, NEAR, onset=np.zeros(2))
 

@@ -56,19 +56,29 @@ class _Contacts(NamedTuple):
         peak: indentation at which a law that softens stops rising, mm; inf where none does.
         width: of the smooth first touch, mm; None: bonded contacts.
         floor: elastic force that is there where nothing presses, N; None: none.
+        bonded: contacts that are glued beside others that are not; None: none.
     """
 
     law: Law
     peak: Float[Array, " m"]
     width: Float[Array, ""] | None
     floor: Float[Array, " m"] | None = None
+    bonded: Bool[Array, " m"] | None = None
 
     def pressed(self, depth):
         """Indentation that enters the law, and its derivative by the depth."""
         if self.width is None:
             return depth, jnp.ones_like(depth)
-        width = self.width
-        return jax.jvp(lambda d: positive_part(d, width), (depth,), (jnp.ones_like(depth),))
+        width, one = self.width, jnp.ones_like(depth)
+        inward, slope = jax.jvp(lambda d: positive_part(d, width), (depth,), (one,))
+        if self.bonded is None:
+            return inward, slope
+        return jnp.where(self.bonded, depth, inward), jnp.where(self.bonded, one, slope)
+
+    def pressing(self, D):
+        """The part of each displacement that presses, or pulls where it may, mm."""
+        inward = D if self.width is None else jnp.maximum(D, 0)
+        return inward if self.bonded is None else jnp.where(self.bonded, D, inward)
 
     def force(self, depth):
         """Force, N. Beyond its peak a law that softens goes on level, so that none falls."""
@@ -94,6 +104,7 @@ def solve(
     present: Bool[Array, " m"] | None = None,
     start: Float[Array, " m"] | None = None,
     floor: Float[Array, " m"] | None = None,
+    bonded: Bool[Array, " m"] | None = None,
 ) -> ContactForces:
     """Series coupling of m contacts: d + C F = D, each with its own law.
 
@@ -114,7 +125,8 @@ def solve(
         start: forces to begin with, N, say of the row before; they change the number of steps, and
             the result by rounding alone.
         floor: of unilateral contacts, elastic force that the wall has where its tool has let go,
-            N, not negative (`contacts_in_time`), with the depth under it; 0 if None.
+            not negative (`contacts_in_time`), with the depth under it; 0 if None.
+        bonded: contacts that are glued although there is a `width` for others. Not with a `floor`.
 
     Returns:
         The `ContactForces`. LIFTED: alone it would touch, but another tool moves the wall away.
@@ -130,10 +142,10 @@ def solve(
     D, C = jnp.where(known, D, 0), jnp.where(known, C, 0)
     law = law._replace(**{n: jnp.where(known, k, 1) for n, k in law.coefficients().items()})
 
-    contacts = _Contacts(law, fold_depth(law), width, floor)
+    contacts = _Contacts(law, fold_depth(law), width, floor, bonded)
     kept = jnp.zeros_like(D) if floor is None else floor
     own = kept if floor is None else law.root(kept, jnp.ones_like(kept), 0.0)
-    alone = _pressing(D, width) * law.k_1 / (1 + jnp.diag(C) * law.k_1)
+    alone = contacts.pressing(D) * law.k_1 / (1 + jnp.diag(C) * law.k_1)
     if start is not None:
         alone = jnp.where(there & jnp.isfinite(start), start, alone)
     depth, force, steps, missed = _newton(*jax.lax.stop_gradient((D, C, contacts, alone)))
@@ -145,9 +157,10 @@ def solve(
     stiffness = largest(jnp.maximum(contacts.tangent(depth), law.k_1) * jnp.diag(C))
     moved = largest(product(jnp.abs(C), jnp.abs(force)))
     free = own + jnp.diag(C) * kept
-    known_motion = moved * eps <= 1e-4 * largest(jnp.maximum(jnp.abs(_pressing(D, width)), free))
+    known_motion = moved * eps <= 1e-4 * largest(jnp.maximum(jnp.abs(contacts.pressing(D)), free))
     balanced = (missed <= 64 * eps) & (stiffness * eps < 0.1) & known_motion
     lifted = there & (D > free) & (width is not None)
+    lifted = lifted if bonded is None else lifted & ~bonded
     status = jnp.where(lifted, PressStatus.LIFTED, PressStatus.NO_CONTACT)
     status = jnp.where(there & (force != kept), PressStatus.OK, status)
     status = jnp.where(balanced, status, PressStatus.NOT_CONVERGED)
@@ -159,11 +172,6 @@ def solve(
     return ContactForces(depth, force, status, steps)
 
 
-def _pressing(D, width):
-    """The part of each displacement that presses (or pulls), mm."""
-    return D if width is None else jnp.maximum(D, 0)
-
-
 def _newton(D, C, contacts: _Contacts, start):
     """Indentations, forces, steps, and how far the last one went, as a share of all motions.
 
@@ -173,7 +181,7 @@ def _newton(D, C, contacts: _Contacts, start):
     towards `start`, as far as the energy falls: forces of contacts that do not know each other may
     lift the wall far beyond all tools.
     """
-    size = largest(jnp.abs(_pressing(D, contacts.width)))
+    size = largest(jnp.abs(contacts.pressing(D)))
 
     def step(state):
         count, g, _, _, _ = state
@@ -200,7 +208,10 @@ def _newton(D, C, contacts: _Contacts, start):
     begin = jnp.zeros((), int), none, none, D, jnp.full_like(size, jnp.inf)
     count, _, force, depth, missed = jax.lax.while_loop(goes, step, begin)
     least = 0 if contacts.floor is None else contacts.floor
-    force = force if contacts.width is None else jnp.maximum(force, least)  # not -1e-17
+    if contacts.width is not None:
+        none_pulls = jnp.maximum(force, least)  # not -1e-17
+        held = contacts.bonded
+        force = none_pulls if held is None else jnp.where(held, force, none_pulls)
     return depth, force, count, missed
 
 

@@ -1,5 +1,6 @@
 """Several tools that press one trachea on the midline, each of which feels the others."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -60,6 +61,7 @@ def press_contacts(
     *,
     onset: ArrayLike | None = None,
     present: ArrayLike | None = None,
+    bonded: ArrayLike | None = None,
 ) -> Contacts:
     """Press with m tools along the inward normals at (s_j, phi = 0) and solve for all forces.
 
@@ -81,6 +83,8 @@ def press_contacts(
         onset: displacement of each tool at first touch, mm; shape (m,). 0 if None.
         present: which tools are there, to press with fewer in the same program; shape (m,). One
             that is not has no force, whatever its place and displacement. All if None.
+        bonded: which tools are glued (forceps, a suture) beside others that are not; shape (m,).
+            None: all as `options.contact` says.
 
     Returns:
         The `Contacts`. Where one number of a row is no number, or one contact of it has no
@@ -95,6 +99,9 @@ def press_contacts(
     check_shapes(geometry, material)
     check_contact_options(options, "press_contacts")
     asked = checked_contacts(geometry, s_c, displacement, onset, present)
+    if bonded is not None:
+        asked = asked._replace(bonded=_truths("bonded", bonded, asked.s_c.shape[0]))
+        options = dataclasses.replace(options, contact="unilateral")
     return _press_contacts(geometry, material, options, asked)
 
 
@@ -105,6 +112,7 @@ class Asked(NamedTuple):
     displacement: Float[Array, "*n m"]
     onset: Float[Array, " m"]
     present: Bool[Array, " m"]
+    bonded: Bool[Array, " m"] | None = None
 
 
 def checked_contacts(
@@ -123,12 +131,22 @@ def checked_contacts(
     m, dtype = s_c.shape[0], s_c.dtype
     displacement = last_axis("displacement", displacement, m, dtype)
     onset = shaped("onset", jnp.zeros_like(s_c) if onset is None else onset, (m,), dtype=dtype)
-    there = jnp.asarray(True if present is None else present)
-    if there.dtype != bool or there.shape not in ((), (m,)):
+    there = _truths("present", True if present is None else present, m)
+    return Asked(s_c, displacement, onset, there)
+
+
+def _truths(name: str, given: ArrayLike, m: int) -> Bool[Array, " m"]:
+    """One truth value of each contact.
+
+    Raises:
+        ValueError: something else.
+    """
+    given = jnp.asarray(given)
+    if given.dtype != bool or given.shape not in ((), (m,)):
         raise ValueError(
-            f"present has shape {there.shape} of {there.dtype}; expected ({m},) of True and False"
+            f"{name} has shape {given.shape} of {given.dtype}; expected ({m},) of True and False"
         )
-    return Asked(s_c, displacement, onset, jnp.broadcast_to(there, (m,)))
+    return jnp.broadcast_to(given, (m,))
 
 
 def checked_places(geometry: Geometry, s_c: ArrayLike) -> Float[Array, " m"]:
@@ -207,7 +225,8 @@ def solve_rows(
         width = jnp.asarray(options.onset_width, displacement.dtype)
 
     def row(D):
-        return solve(D - onset, compliance, law, width=width, present=asked.present)
+        there, glued = asked.present, asked.bonded
+        return solve(D - onset, compliance, law, width=width, present=there, bonded=glued)
 
     solved = jax.vmap(row)(displacement.reshape(-1, displacement.shape[-1]))
     force, depth, status = (

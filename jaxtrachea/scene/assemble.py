@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,6 +107,10 @@ def make_scene(
             tube = round_wall(geometry, float(outer))
         else:
             tube = checked_walls(geometry, mesh, progress)
+    kinds: dict[str, Any] = {n: t.contact or effects.contact for n, t in tools.items()}
+    mixed = len(set(kinds.values())) > 1
+    of_all = "unilateral" if mixed else next(iter(kinds.values()))
+    effects = dataclasses.replace(effects, contact=of_all)
     instruments = []
     for name, shape in shapes.items():
         near, quality, mu = 1, STANDARD, tools[name].friction
@@ -115,7 +120,7 @@ def make_scene(
         instruments.append(Instrument(
             name=name, tool=shape, friction=None if mu is None else jnp.asarray(mu, dtype),
             footprint=jnp.asarray(_footprint(shape, float(outer)), dtype), near=near,
-            quality=quality,
+            quality=quality, contact=kinds[name] if mixed else None,
         ))  # fmt: skip
     binding = None if mesh is None or sections else regions.bind(mesh, geometry)
     spacing = max((instrument.footprint for instrument in instruments), key=float)
@@ -125,11 +130,10 @@ def make_scene(
         plan=make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False)),  # not read
     )  # fmt: skip
     each = [scene_of(scene, instrument) for instrument in instruments]
-    bonded = effects.contact == "bonded"
     facts = facts_together([
-        facts_of(view, material, p, bonded=bonded)
-        for view, p in zip(each, paths.values(), strict=True)
-    ])  # fmt: skip
+        facts_of(view, material, paths[name], bonded=kinds[name] == "bonded")
+        for view, name in zip(each, kinds, strict=True)
+    ], glued=mixed)  # fmt: skip
     if isinstance(path, Mapping):
         scene = dataclasses.replace(scene, instruments=tuple(instruments))
     else:

@@ -306,11 +306,11 @@ def _tools(
         return None, ()
     if isinstance(section, ToolSection):
         shape, notes = _tool(section, "tool", folder, files)
-        return Tool(shape, section.friction), notes
+        return Tool(shape, section.friction, section.contact), notes
     tools, notes = {}, ()
     for i, one in enumerate(section):
         shape, seen = _tool(one, f"tool.{i}", folder, files)
-        tools[one.name] = Tool(shape, one.friction)
+        tools[one.name] = Tool(shape, one.friction, one.contact)
         notes += tuple(f"{one.name}: {note}" for note in seen)
     return tools, notes
 

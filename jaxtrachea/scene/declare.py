@@ -55,6 +55,7 @@ class SceneFacts:
         timed: whether the path has times.
         duration: from its first time to its last, s.
         tools: number of tools with a path.
+        glued: whether some of them are glued, and others not.
     """
 
     poses: bool = False
@@ -76,6 +77,7 @@ class SceneFacts:
     timed: bool = False
     duration: float = 0.0
     tools: int = 1
+    glued: bool = False
 
 
 class Case(NamedTuple):

@@ -39,7 +39,8 @@ def _contact_point(case: Case) -> Verdict:
             return Verdict("fixed", "one contact point")
         why = "the presses have different contact points"
         return Verdict("per_step", "several contact points", {"fixed": (why, "use 'auto'")})
-    glued, sections = case.options.contact == "bonded", SECTIONS in facts.known
+    glued = facts.glued or case.options.contact == "bonded"
+    sections = SECTIONS in facts.known
     wished = case.options.friction == "off" and "friction" not in case.finest
     if wished and not (glued or sections):
         reason = "friction is off as you wish: every row is a frictionless press of its own"
@@ -261,6 +262,11 @@ def _no_company(case: Case) -> tuple[str, str] | None:
         return cannot[0], f"{cannot[1]}, {one_each}"
     if levels["skeleton"] != "linear":
         return "a skeleton softens by one contact", f"set skeleton 'linear', {one_each}"
+    if case.facts.glued and (levels["relaxation"] != "off" or case.options.coupling == "total"):
+        return (
+            "forces of glued tools beside others neither relax nor go with coupling 'total'",
+            f"set relaxation 'off' and coupling 'series', {one_each}",
+        )
     if levels["relaxation"] == "parts":
         return (
             "parts that relax apart are derived for one contact",
@@ -280,7 +286,7 @@ def _no_lines(case: Case) -> tuple[str, str] | None:
             "give each tool its friction (0: it slides freely), press straight in, or set "
             "contact_point 'per_step' (frictionless)",
         )
-    if case.options.contact == "bonded":
+    if case.facts.glued or case.options.contact == "bonded":
         return (
             "off the midline, or where rings bend, a tool that is glued holds the wall along the "
             "surface, too, which is derived for one tool",

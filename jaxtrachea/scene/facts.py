@@ -105,8 +105,13 @@ def facts_of(
     )  # fmt: skip
 
 
-def facts_together(each: Sequence[SceneFacts]) -> SceneFacts:
-    """What the rules need to know of several tools of one scene: what one of them needs."""
+def facts_together(each: Sequence[SceneFacts], *, glued: bool = False) -> SceneFacts:
+    """What the rules need to know of several tools of one scene: what one of them needs.
+
+    Args:
+        each: of every tool.
+        glued: some of them are glued, and others not.
+    """
 
     def joined(name: str):
         values = [getattr(facts, name) for facts in each]
@@ -119,7 +124,7 @@ def facts_together(each: Sequence[SceneFacts]) -> SceneFacts:
     whole += "way_fixed", "way_per_step", "duration", "drags"
     changed = {name: joined(name) for name in whole}
     rubs = all(facts.friction for facts in each)
-    return dataclasses.replace(each[0], tools=len(each), friction=rubs, **changed)
+    return dataclasses.replace(each[0], tools=len(each), friction=rubs, glued=glued, **changed)
 
 
 def _largest(v) -> float:

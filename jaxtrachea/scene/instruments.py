@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Bool
 
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.stage import Instrument, Poses, Presses, Scene, check_path, touch_rows
@@ -19,13 +20,22 @@ Pull = Callable[[list[tuple[Any, Any, Any]]], list[Poses]]
 def scene_of(scene: Scene, instrument: Instrument) -> Scene:
     """The scene as if this instrument were its only tool."""
     own = {f.name: getattr(instrument, f.name) for f in dataclasses.fields(Instrument)}
+    plan, contact = scene.plan, own.pop("contact")
     del own["name"]
-    return dataclasses.replace(scene, instruments=(), **own)
+    if contact is not None:
+        options = dataclasses.replace(plan.options, contact=contact)
+        plan = dataclasses.replace(plan, options=options)
+    return dataclasses.replace(scene, instruments=(), plan=plan, **own)
 
 
 def views(scene: Scene) -> list[Scene]:
     """The scene as each tool sees it."""
     return [scene_of(scene, instrument) for instrument in scene.instruments]
+
+
+def glued(scene: Scene) -> Bool[np.ndarray, " m"]:
+    """Which instruments of a scene are glued to the wall."""
+    return np.array([view.plan.options.contact == "bonded" for view in views(scene)])
 
 
 def paths_in_order(

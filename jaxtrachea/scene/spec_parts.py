@@ -239,6 +239,8 @@ class ToolSection(ShapeSection):
     """convex parts that move together, in the place of a shape: the deepest touches"""
     friction: float | None = Field(None, ge=0, le=10)
     """coefficient of Coulomb friction"""
+    contact: Literal["unilateral", "bonded"] | None = None
+    """of this tool: `bonded`: glued (forceps, a suture); none: that of [model]"""
 
     def _without_shape(self, given: set[str]):
         if self.parts is None:

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -71,17 +71,20 @@ class Tool:
         shape: about its own origin, convex or of convex parts (`contact.shapes.compound`); None:
             presses are given at their contact points.
         friction: Coulomb's coefficient; None: the tool holds the surface.
+        contact: `bonded`: glued (forceps, a suture), `unilateral`; None: as `EffectOptions` says.
     """
 
     shape: Shape | None = None
     friction: float | None = None
+    contact: Literal["unilateral", "bonded"] | None = None
 
     def __post_init__(self):
-        """Refuse a friction that there is not, and what is no shape.
+        """Refuse a friction that there is not, what is no shape, and a contact that is none.
 
         Raises:
-            ValueError: negative or not finite.
+            ValueError: negative or not finite; another word.
         """
+        check_word("tool.contact", self.contact, Literal["unilateral", "bonded"] | None)
         friction = self.friction
         check_word("tool.shape", self.shape, Shape | None)
         if friction is not None and not 0 <= float(friction) < math.inf:
@@ -173,6 +176,7 @@ class Instrument(eqx.Module):
         footprint: -
         near: -
         quality: -
+        contact: of this tool, where others have another (static); None: that of the plan.
     """
 
     name: str = eqx.field(static=True)
@@ -181,6 +185,7 @@ class Instrument(eqx.Module):
     footprint: Float[Array, ""]
     near: int = eqx.field(static=True)
     quality: Settings = eqx.field(static=True)
+    contact: Literal["unilateral", "bonded"] | None = eqx.field(static=True, default=None)
 
 
 class Scene(eqx.Module):

@@ -1,11 +1,13 @@
 """A step of several tools that feel each other: the next state of each, and what all of them do."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import full_precision
@@ -18,7 +20,7 @@ from jaxtrachea.scene.approach import Approach, on_its_own
 from jaxtrachea.scene.grip import pick
 from jaxtrachea.scene.hold import hold
 from jaxtrachea.scene.in_time import Before, resting
-from jaxtrachea.scene.instruments import touch_and_pull, touch_together, views
+from jaxtrachea.scene.instruments import glued, touch_and_pull, touch_together, views
 from jaxtrachea.scene.memory import Memory
 from jaxtrachea.scene.rows import enter, rows_of
 from jaxtrachea.scene.rub_together import rub_step
@@ -104,7 +106,7 @@ def move_tools(
         touching, known = after.touching, rows.at.known
     else:
         after, made, touching, known = _hold(scene, material, state, paths, seen, present, rest)
-    there = present & touching if scene.plan.options.contact == "bonded" else present
+    there = present & (touching | ~glued(scene))
     ways = [jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)]
     memory, before = after.memory, None
     if memory is not None:
@@ -134,12 +136,12 @@ def _hold(
     """All tools on their places: next states, ways, who is on its place, whose pose is known.
 
     One that is not present counts as clear of the wall. How a tool holds its place does not depend
-    on its shape: one program serves all.
+    on its shape: one program serves all that are glued, one all others.
     """
     each, rows = views(scene), rows_of(scene, state, paths, seen, present)
 
-    def one(row):
-        view, here, side, inside = enter(each[0], row)
+    def one(first, row):
+        view, here, side, inside = enter(first, row)
         old, (path, touch), at = row.state, here, row.at
         if view.plan.contact_point == "per_step":
             made = on_its_own(view, path, touch)._replace(inside=inside)
@@ -151,7 +153,19 @@ def _hold(
         new = pick(at.known, dataclasses.replace(new, side=side), old)
         return new, made, held.touching, at.known
 
-    return jax.lax.map(one, rows)
+    def of_kind(which):
+        if len(which) == len(each):
+            return jax.lax.map(functools.partial(one, each[0]), rows)
+        some = jax.tree.map(lambda v: v[which], rows)
+        return jax.lax.map(functools.partial(one, each[which[0]]), some)
+
+    held = glued(scene)
+    kinds = [which for which in (np.flatnonzero(~held), np.flatnonzero(held)) if len(which)]
+    parts = [of_kind(which) for which in kinds]
+    if len(parts) == 1:
+        return parts[0]
+    back = np.argsort(np.concatenate(kinds))
+    return jax.tree.map(lambda *v: jnp.concatenate(v)[back], *parts)
 
 
 def _where_pressed(made: Approach, memory: Memory, touching: Bool[Array, ""]) -> Approach:

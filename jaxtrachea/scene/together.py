@@ -29,7 +29,7 @@ from jaxtrachea.scene import dents, lines, trail
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.configurational import Contacts, forces_by_poses
 from jaxtrachea.scene.in_time import Before, samples_of
-from jaxtrachea.scene.instruments import Pull, views
+from jaxtrachea.scene.instruments import Pull, glued, views
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
@@ -139,8 +139,8 @@ def press_together(
         # Along their own normals: a tool that waits behind the tube is computed as one in front.
         D = jnp.stack([jnp.sum(p.displacement * n, axis=1) for p, _, n, _ in found], axis=1)
         D = jnp.where(hidden[:, None], 0, D)
-        if present is None and scene.plan.options.contact == "bonded":
-            present = _touched(made, D)
+        if present is None and glued(scene).any():
+            present = _touched(made, D) | ~glued(scene)[None]
         slid, solved = None, _forces(scene, safe, s, phi, D, present, samples)
     vectors, rings, followed = _motion(scene, s, phi, solved, slid)
     moved = Together(s, phi, *followed, made=list(made), paths=paths, hidden=hidden)
@@ -262,7 +262,8 @@ def _touched(made: Sequence[Approach | None], D) -> Bool[Array, "rows m"]:
 
 def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Samples | None):
     """All contacts in balance, without friction."""
-    options = scene.plan.options
+    options, held = scene.plan.options, glued(scene)
+    mixed = held.any() and not held.all()
     unit = _influence(scene, material, s, phi)
     law = jax.vmap(lambda at: local_law(scene.geometry, material, at, options))(s)
     width, C = None, unit.compliance
@@ -272,13 +273,14 @@ def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Sampl
         found = solve_in_time(D, _felt(scene, C), law, samples, width=width, present=present)
         depth, force, load = found.depth, found.force, found.elastic
         solved = _Solved(unit, depth, force, load, found.status, found.history)
-    elif scene.plan.tools == "coupled":
+    elif scene.plan.tools == "coupled" or mixed:
+        bonded, felt = jnp.asarray(held) if mixed else None, _felt(scene, C)
 
         def row(D, present):
-            return solve(D, C, law, width=width, present=present)
+            return solve(D, felt, law, width=width, present=present, bonded=bonded)
 
         found = jax.vmap(row, (0, None if present is None else 0))(D, present)
-        depth = found.depth if width is None else jnp.maximum(found.depth, 0)
+        depth = jnp.where(held[None], found.depth, jnp.maximum(found.depth, 0))
         solved = _Solved(unit, depth, found.force, found.force, found.status)
     else:
         there = D if present is None else jnp.where(present, D, 0)

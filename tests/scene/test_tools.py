@@ -444,6 +444,36 @@ def test_tools_that_wander():
 
 
 @pytest.mark.long
+def test_forceps_hold_beside_a_finger():
+    """A glued tool presses and draws; the path and a session are `press_contacts`."""
+    height = np.concatenate([np.linspace(1, -1.5, 4), np.linspace(-1, 3, 5)])
+    paths = {
+        name: poses([s, 0, 0], [s, 0, 0], 9) for name, s in (("forceps", 70.0), ("finger", 80.0))
+    }
+    for name, h in (("forceps", height), ("finger", np.linspace(0.5, -3, 9))):
+        up = np.stack([0 * h, OUTER + 5 + h, 0 * h], axis=1)
+        paths[name] = dataclasses.replace(paths[name], translation=paths[name].translation + up)
+    tools = {"forceps": Tool(BALL, contact="bonded"), "finger": Tool(BALL)}
+    scene = make_scene(TUBE, SPRINGS, paths, tool=tools, mesh=ROUND)
+    out = jax.device_get(jax.jit(simulate)(scene, SPRINGS, paths))
+    found = press_contacts(
+        TUBE, SPRINGS, out.s[0], -out.displacement[..., 1], bonded=[True, False], present=True
+    )
+    np.testing.assert_allclose(out.force[..., 1], -np.asarray(found.force), rtol=0, atol=1e-14)
+    assert out.force[-1, 0, 1] > 0.2  # it draws
+    assert (out.status[2:] == OK).all()
+    session = Session(scene, SPRINGS)
+    for i in range(9):
+        step = session.step(
+            {n: (np.eye(3), np.asarray(p.translation)[i]) for n, p in paths.items()}
+        )
+        np.testing.assert_allclose(step.force, out.force[i], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(step.vertices, out.vertices[i], rtol=0, atol=1e-12)
+    with pytest.raises(PlanError, match="a tool that is glued holds the wall along the surface"):
+        make_scene(TUBE, MATERIAL, paths, tool=tools, effects=BARE)
+
+
+@pytest.mark.long
 def test_a_tool_that_waits_behind_the_tube_changes_nothing():
     """On the midline, of a tool that wanders: all as of the one, the part along the wall too."""
     paths = {"left": ball([70, -2, 0], [78, -3, 0]), "right": poses([110, -27, 0], [112, -27, 0])}
@@ -552,6 +582,7 @@ def test_what_does_not_go_together():
          "set relaxation 'uniform' or 'off'"),
         ({"known": frozenset({"e_1", "e_2"}), "way_fixed": (0.0, 0.2), "softness": (-1.4, 0.9)}, {},
          "set skeleton 'linear'"),
+        ({"glued": True}, {"coupling": "total"}, "set relaxation 'off' and coupling 'series'"),
         ({}, {"tools": "one"}, "2 tools have a path"),
         ({}, {"tools": "coupled", "coupling": "total"}, "contacts do not feel one another"),
         ({"tools": 1}, {"tools": "coupled"}, "one tool has a path"),
