@@ -197,6 +197,25 @@ def pressed(s, D, values, present, onset=0.0, *, options=Options()):
     return press_contacts(table_1(), material, s, D, options, onset=onset, present=present)
 
 
+@pytest.mark.long
+def test_float32_says_where_a_stiff_law_leaves_no_digits():
+    """k_3 up to 1e10 N/mm^3: what has a number is that of float64."""
+    D, C, k_1, *_ = random_scenes(500, 6)
+    run = on_host(jax.jit(jax.vmap(
+        lambda D, C, *law: solve(D, C, Law(*law), width=jnp.asarray(1e-3, D.dtype))
+    )))  # fmt: skip
+    for k_3 in (1.0, 1e4, 1e7, 1e10):
+        given = D, C, k_1, np.full_like(k_1, k_3)
+        true = run(*given)
+        found = run(*(np.asarray(v, np.float32) for v in given))
+        solved = np.isfinite(found.force).all(1)
+        off = np.abs(found.force - true.force).max(1) / np.abs(true.force).max(1).clip(1e-30)
+        assert np.isfinite(true.force).all(1).mean() > 0.7
+        assert np.nanmax(off[solved]) < 2e-4
+        assert not np.isin(found.status[~solved], [OK, NO_CONTACT, LIFTED]).any()
+        assert solved.mean() > (0.9 if k_3 < 10 else 0.1)
+
+
 @on_host
 @functools.partial(jax.jit, static_argnames="options")
 def alone(s, D, values, *, options):
