@@ -61,6 +61,7 @@ WITHIN = {
         {"hold"},
         {"rub_together"},
         {"together"},
+        {"deform_together"},
         {"assemble", "simulation", "sweep"},
         {"held_force", "one_row"},
         {"step_together"},

@@ -12,9 +12,9 @@ from jax.core import Tracer
 
 from jaxtrachea._packed import Packing
 from jaxtrachea.fusion import fuse
+from jaxtrachea.scene.deform_together import deform_together
 from jaxtrachea.scene.simulation import Simulation, surface
 from jaxtrachea.scene.stage import Scene
-from jaxtrachea.scene.together import deform_together
 
 #: Arrays of the result that have a number for every ring or vertex.
 LARGE = ("joints", "loads", "end_U", "end_V", "vertices")

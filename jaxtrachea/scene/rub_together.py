@@ -121,7 +121,8 @@ def rub_step(
     frames = jax.vmap(local_frame)(led.anchor.phi)
     unit, law = influence_of(scene, material, *places), law_of(scene, material, places[0])
     way = jnp.where(known, led.way, jnp.nan)
-    slid = rub_once(scene, unit, law, way, present)
+    # A tool in the lumen presses nothing, however deep it is in the wall.
+    slid = rub_once(scene, unit, law, way, present & (led.touching | ~(led.way[:, 0] > 0)))
     # In the frame of the tube, where the places have turned since the step before.
     force, depth = (jnp.einsum("mk,mkx->mx", v, frames) for v in (slid.force, slid.depth))
     earlier = jnp.einsum("mx,mkx->mk", led.slip.force, frames)

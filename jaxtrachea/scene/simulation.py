@@ -21,6 +21,7 @@ from jaxtrachea.mechanics.press_history import History
 from jaxtrachea.scene.approach import Approach, approach, approach_together
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform, deform_sections
+from jaxtrachea.scene.deform_together import deform_together
 from jaxtrachea.scene.in_time import Before, before_path, samples_of
 from jaxtrachea.scene.instruments import paths_in_order, scene_of
 from jaxtrachea.scene.programs import Moved, move
@@ -40,7 +41,7 @@ from jaxtrachea.scene.stage import (
     check_material,
     check_path,
 )
-from jaxtrachea.scene.together import deform_together, press_together
+from jaxtrachea.scene.together import press_together
 from jaxtrachea.status import PressStatus
 
 #: Fields of a `Simulation` that there is one of for each tool.
