@@ -37,6 +37,7 @@ class Live(Worker):
         frame: the last one; None: none yet.
         steps: the last steps, without their vertices.
         recording: frames that are kept; None: nothing is recorded.
+        in_hand: the tool that was moved last.
     """
 
     def __init__(self, path: Path, set_up: Callable[[], None] = lambda: None):
@@ -54,6 +55,7 @@ class Live(Worker):
         self.frame: Frame | None = None
         self.steps: list[Frame] = []
         self.recording: list[Frame] | None = None
+        self.in_hand = 0
         self._values: dict[str, float] = {}
         self._poses = np.zeros((0, 12))
         self._fresh = self._reset = False
@@ -62,7 +64,7 @@ class Live(Worker):
     def move(self, pose: np.ndarray, tool: int = 0) -> None:
         """Move a tool: rotation by rows, then translation, mm; shape (12,)."""
         with self._wake:
-            self._poses[tool], self._fresh = pose, True
+            self._poses[tool], self._fresh, self.in_hand = pose, True, tool
             self._wake.notify()
 
     def set_value(self, name: str, value: float) -> None:
