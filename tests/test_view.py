@@ -355,12 +355,16 @@ def test_a_recording_plays_from_disk(browser, recording):
 
 
 @pytest.mark.long
-def test_a_recording_of_another_version_is_refused(simulation, tmp_path):
+def test_a_recording_of_another_version_is_refused(simulation, tmp_path, monkeypatch, capsys):
     file = Path(shutil.copy(simulation, tmp_path))
     with h5py.File(file, "r+") as changed:
         changed.attrs["schema_version"] = 1
     with pytest.raises(PlayError, match="version 1; expected 2; simulate the scene again"):
         of_file(file)
+    assert run(monkeypatch, capsys, "play", file.parent)[0] == 2
+    shutil.copy(simulation, file)
+    assert run(monkeypatch, capsys, "play", file.parent)[0] == 0  # the folder of a simulation
+    assert file.with_name("play.html").exists()
     file.write_text("none")
     with pytest.raises(PlayError, match="no HDF5 file"):
         of_file(file)
@@ -373,6 +377,8 @@ def test_bad_input_ends_the_command(server, scene_file, tmp_path, monkeypatch, c
     none = run(monkeypatch, capsys, "view", tmp_path / "none.toml")
     assert none[0] == 2
     assert "there is no such file" in none[2]
+    none = run(monkeypatch, capsys, "view", shutil.copy(scene_file, tmp_path / "simulation.h5"))
+    assert "a simulation.h5 plays: jaxtrachea play" in none[2]
     none = run(monkeypatch, capsys, "play", tmp_path / "none.h5")
     assert none[0] == 2
     assert "name a simulation.h5" in none[2]

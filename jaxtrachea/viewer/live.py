@@ -104,7 +104,7 @@ class Live(Worker):
         self.packet = tools_packet(
             handled.title, handled.names, handled.tools, handled.poses, tube_arrays(*tube_of(scene))
         )
-        self.tell("compiling", "compiling the scene")
+        self.tell("compiling", "compiling the scene: up to a minute the first time, seconds later")
         session = handled.session()
         self.sliders = sliders(_long_run(session.material), scene.plan)
         # The first step also loads what runs at the first step only.

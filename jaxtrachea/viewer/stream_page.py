@@ -81,9 +81,13 @@ class StreamPage(Page):
              "lineStyle": {"width": 2 if name == "estimate" else 1}}
             for name, colour in colours.items()
         ]  # fmt: skip
-        lines[0]["markLine"] = {"symbol": "none", "silent": True, "data": [],
-                                "lineStyle": {"color": "#999", "type": "dotted"},
-                                "label": {"formatter": "{b}", "fontSize": 10, "distance": 8}}
+        lines[0]["markLine"] = {
+            "symbol": "none",
+            "silent": True,
+            "data": [],
+            "lineStyle": {"color": "#999", "type": "dotted"},
+            "label": {"formatter": "{b}", "fontSize": 10, "distance": 8},
+        }
         return ui.echart({
             "animation": False, "title": {"text": label, "textStyle": {"fontSize": 13}},
             "grid": {"left": 64, "right": 16, "top": 52, "bottom": 40},
