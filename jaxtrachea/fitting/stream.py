@@ -208,9 +208,11 @@ class Stream:
         """At most `TOGETHER` blocks, each at the point of its equations; finite ones are put in."""
         lanes, full = self.study.lanes, [jobs[i % len(jobs)] for i in range(TOGETHER)]
         t, number = self._place[[b for _, b in full]].T
-        arrays = {k: self._by_block(getattr(lanes, k))[t, number] for k in _OF_SAMPLES}
+        arrays: dict[str, Any] = {
+            k: self._by_block(getattr(lanes, k))[t, number] for k in _OF_SAMPLES
+        }
         seen, arrays["s_c"] = arrays["precision"] > 0, lanes.s_c[0, t]
-        part: dict[str, Any] = {k: v[:, None].astype(self._dtype) for k, v in arrays.items()}
+        part = {k: v[:, None].astype(self._dtype) for k, v in arrays.items()}
         theta = np.array([equations.point for equations, _ in full], self._dtype)
         point = self._program(theta, self._blocks._replace(**part), self._ones)
         found = (point.cost, point.gradient, point.hessian, point.value)

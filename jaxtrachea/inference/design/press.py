@@ -108,10 +108,10 @@ class Guess(NamedTuple):
         approach: how long before first touch the record begins, mm.
     """
 
-    theta: Float[np.ndarray, " P"]
+    theta: Any
     value: Any
-    blend: Float[np.ndarray, ""] | None
-    approach: Float[np.ndarray, ""]
+    blend: Any
+    approach: Any
 
 
 class Place(NamedTuple):
