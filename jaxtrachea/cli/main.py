@@ -86,10 +86,10 @@ def main() -> None:
         usage = getattr(error, "format_message", None)
         if usage is None:
             raise
-        if len(sys.argv) > 1:
-            code = complain(usage())
-        else:  # no command: the help
-            code = typer.echo(usage())
+        if len(sys.argv) == 1:  # no command: the help
+            typer.echo(usage())
+            sys.exit(0)
+        code = complain(usage())
     if code == 130:  # some versions of typer turn Ctrl-C into this exit code themselves
         to_stderr("stopped; nothing was written")
     elif (traces := sys.modules.get("jaxtrachea.files.traces")) is not None:

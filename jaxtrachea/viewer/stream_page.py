@@ -81,13 +81,9 @@ class StreamPage(Page):
              "lineStyle": {"width": 2 if name == "estimate" else 1}}
             for name, colour in colours.items()
         ]  # fmt: skip
-        lines[0]["markLine"] = {
-            "symbol": "none",
-            "silent": True,
-            "data": [],
-            "lineStyle": {"color": "#999", "type": "dotted"},
-            "label": {"formatter": "{b}", "fontSize": 10, "distance": 8},
-        }
+        label = {"formatter": "{b}", "fontSize": 10, "distance": 8}
+        lines[0]["markLine"] = {"symbol": "none", "silent": True, "data": [], "label": label,
+                                "lineStyle": {"color": "#999", "type": "dotted"}}  # fmt: skip
         return ui.echart({
             "animation": False, "title": {"text": label, "textStyle": {"fontSize": 13}},
             "grid": {"left": 64, "right": 16, "top": 52, "bottom": 40},
@@ -158,6 +154,9 @@ class StreamPage(Page):
         if kind == "log":
             low, high = 10 ** np.floor(np.log10(low)), 10 ** np.ceil(np.log10(high))
         ends = {"min": float(low), "max": float(high)} if high > low else {}
+        # Points far outside lie just beyond the ends, above 0 on an axis of logarithms.
+        room = (low / 10, high * 10) if kind == "log" else (2 * low - high, 2 * high - low)
+        lines = np.clip(lines, *room) if ends else lines
         chart.options["yAxis"] = {"type": kind, "scale": True, "axisLabel": NO_ENDS, **ends}
         for series, line in zip(chart.options["series"], lines, strict=True):
             series["data"] = [[s.samples, float(v) if np.isfinite(v) else None]
