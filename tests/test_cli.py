@@ -460,7 +460,7 @@ def test_real_process_says_what_is_wrong(study):
 def test_version_and_help(monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, "--version")
     assert (code, out.strip()) == (0, jaxtrachea.__version__)
-    for arguments in (["--help"], *([c, "--help"] for c in ("fit", "check", "init", "design"))):
+    for arguments in ([], ["--help"], *([c, "--help"] for c in ("fit", "check", "init", "design"))):
         code, out, _ = run(monkeypatch, capsys, *arguments)
         assert code == 0
         assert "Usage: jaxtrachea" in out

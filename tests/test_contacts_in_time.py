@@ -266,3 +266,34 @@ def test_a_session_of_tools_relaxes_as_a_path_does():
     assert -lifted.skeleton[0, 1] > 0.1  # the wall has not come back yet
     late = session.step({}, dt=np.float64(1e3))
     assert abs(late.skeleton[0, 1]) < abs(lifted.skeleton[0, 1])
+
+
+@pytest.mark.long
+def test_a_tool_is_dragged_over_a_wall_that_relaxes():
+    """Along and round; after a long rest both forces are the elastic ones of where they stand."""
+    material, off = jt.RelaxingMaterial(SPRINGS, RELAXATION), OUTER + 5.0
+    turns, times = jnp.stack([jnp.eye(3)] * 2), jnp.array([0.0, 1.0])
+    paths = {
+        name: jt.Poses(turns, jnp.array([[s, off + 5, 0.0]] * 2), times)
+        for name, s in (("left", 70.0), ("right", 97.0))
+    }
+    effects = dataclasses.replace(BARE, second_plane="on", contact_point="fixed")
+    scene = jt.make_scene(TUBE, material, paths, tool=dict.fromkeys(paths, BALL), effects=effects)
+    session = jt.Session(scene, material)
+
+    def step(s, phi, depth, dt):
+        place = np.array([s, (off - depth) * np.cos(phi), (off - depth) * np.sin(phi)])
+        ways = {"left": place, "right": np.array([97.0, off - 1.5, 0])}
+        return session.step({n: (np.eye(3), way) for n, way in ways.items()}, dt=np.float64(dt))
+
+    rows = [step(70, 0, d, 0.05) for d in np.linspace(0, 2, 20)]
+    rows += [step(s, 0, 2, 0.05) for s in np.linspace(70, 83, 60)]
+    rows += [step(83, phi, 2, 0.05) for phi in np.linspace(0, 0.8, 60)]
+    rows.append(step(83, 0.8, 2, 1e9))
+    assert {int(v) for row in rows for v in row.status} <= {PressStatus.OK, PressStatus.NO_CONTACT}
+    D = np.array([[2, 1.5]])
+    true = jt.press_contacts_oblique(TUBE, SPRINGS, [83.0, 97.0], [0.8, 0.0], D, scene.plan.oblique)
+    size = [np.linalg.norm(v, axis=-1) for v in (rows[-1].force, true.force[0])]
+    # The place follows at a distance of a twentieth of the depth.
+    np.testing.assert_allclose(*size, rtol=0.02)
+    assert np.linalg.norm(rows[-2].force[0]) > 1.05 * size[0][0]

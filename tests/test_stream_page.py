@@ -1,6 +1,7 @@
 """The page of a fit: samples one by one, intervals that shrink; guarded as that of a scene."""
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import synthetic
 pytest.importorskip("nicegui", reason="the extra 'viewer' is not installed")
 from browser import CHROMIUM, Browser
 from page_server import Server
+
+from jaxtrachea.cli.view import _experiment
 
 #: An experiment: EI_L, k_M, k_1, k_3, and its specification.
 TRUTH, DEPTHS = np.array([300.0, 1.0, 0.5, 0.2]), np.linspace(0.5, 6.0, 12)
@@ -70,6 +73,12 @@ def test_a_fit_sample_by_sample(tmp_path):
         if window is not None:
             window.close()
     assert "Warning" not in "".join(server.lines)
+
+
+def test_what_is_no_stream_is_said_in_words_of_the_command():
+    fit = Path(__file__).parents[1] / "fits" / "virtual_trachea" / "fit.toml"
+    with pytest.raises(ValueError, match=f"noise.joints is .*; jaxtrachea fit {fit} takes"):
+        _experiment(fit, print)
 
 
 def lengths(window):

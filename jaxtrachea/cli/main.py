@@ -86,6 +86,9 @@ def main() -> None:
         usage = getattr(error, "format_message", None)
         if usage is None:
             raise
+        if len(sys.argv) == 1:  # no command: the help
+            typer.echo(usage())
+            sys.exit(0)
         code = complain(usage())
     if code == 130:  # some versions of typer turn Ctrl-C into this exit code themselves
         to_stderr("stopped; nothing was written")

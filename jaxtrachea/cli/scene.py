@@ -165,7 +165,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 bar.update(task, completed=min(start + size, total))
         out = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         clock.append(time.perf_counter())
-        say_lost(save_each(folder, draw_sweep(s, phi, out))[1])
+        say_lost(save_each(folder, draw_sweep(s, phi, want.depth, out))[1])
         made = _provenance(scene, staged, clock)
         write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
         if spec.output.vtk and (mesh := staged.scene.mesh) is not None:

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
 
 PortOption = Annotated[
@@ -61,6 +62,8 @@ def _content(file: Path) -> dict:
 
     if not file.is_file():
         raise Stop(f"{file}: there is no such file; name a scene or a fit specification (TOML)")
+    if file.suffix == ".h5":
+        raise Stop(f"{file}: no scene; a simulation.h5 plays: jaxtrachea play {file}")
     try:
         content = read_tables(file, "scene")
     except SpecError as error:
@@ -97,12 +100,16 @@ def _experiment(path: Path, begin: Callable[[str], None]):
     assert recipe is not None
     places = {c.s_c for c in curves if c.s_c is not None}
     begin("compiling the fit of a sample")
-    online = Online(
-        recipe.geometry, recipe.options, recipe.parameters, noise=recipe.noise,
-        depth=max(float(c.displacement.max()) for c in curves),
-        candidates=sorted(places),
-        samples=round(sum(len(c.force) for c in curves) / len(curves)),
-    )  # fmt: skip
+    try:
+        online = Online(
+            recipe.geometry, recipe.options, recipe.parameters, noise=recipe.noise,
+            depth=max(float(c.displacement.max()) for c in curves),
+            candidates=sorted(places),
+            samples=round(sum(len(c.force) for c in curves) / len(curves)),
+        )  # fmt: skip
+    except InputError as error:
+        cure = f"jaxtrachea fit {path} takes its curves together"
+        raise InputError.like(error, place=str(path), cure=cure) from None
     return Experiment(online, curves, {p.name: p.unit for p in recipe.parameters})
 
 
@@ -116,7 +123,8 @@ def play(
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.viewer.play import PlayError, of_file
 
-    path = out_file or simulation.with_name("play.html")
+    folder = simulation if simulation.is_dir() else simulation.parent
+    path = out_file or folder / "play.html"
     try:
         write_text(path, of_file(simulation))
     except PlayError as error:

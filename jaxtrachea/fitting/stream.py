@@ -208,21 +208,22 @@ class Stream:
         """At most `TOGETHER` blocks, each at the point of its equations; finite ones are put in."""
         lanes, full = self.study.lanes, [jobs[i % len(jobs)] for i in range(TOGETHER)]
         t, number = self._place[[b for _, b in full]].T
-        part: dict[str, Any] = {
-            k: self._by_block(getattr(lanes, k))[t, number][:, None] for k in _OF_SAMPLES
+        arrays: dict[str, Any] = {
+            k: self._by_block(getattr(lanes, k))[t, number] for k in _OF_SAMPLES
         }
-        part["s_c"] = lanes.s_c[0, t][:, None]
-        theta = np.stack([equations.point for equations, _ in full])
-        theta, part = cast((theta, part), self._dtype)
+        seen, arrays["s_c"] = arrays["precision"] > 0, lanes.s_c[0, t]
+        part = {k: v[:, None].astype(self._dtype) for k, v in arrays.items()}
+        theta = np.array([equations.point for equations, _ in full], self._dtype)
         point = self._program(theta, self._blocks._replace(**part), self._ones)
         found = (point.cost, point.gradient, point.hessian, point.value)
         cost, gradient, hessian, value = (np.asarray(v, np.float64) for v in found)
-        seen = part["precision"][:, 0] > 0
+        residual = np.where(seen, value[:, 0] * self._sigma, np.nan)
+        finite = np.isfinite(cost) & np.isfinite(hessian).all(axis=(1, 2))
         for i, (equations, b) in enumerate(jobs):
-            if np.isfinite(cost[i]) and np.isfinite(hessian[i]).all():
+            if finite[i]:
                 equations.cost[b], equations.gradient[b] = cost[i], gradient[i]
                 equations.hessian[b], equations.fresh[b] = hessian[i], True
-                equations.residual[b] = np.where(seen[i], value[i, 0] * self._sigma, np.nan)
+                equations.residual[b] = residual[i]
 
     @staticmethod
     def _by_block(array: Float[np.ndarray, "1 T N"]) -> Float[np.ndarray, "T blocks samples"]:

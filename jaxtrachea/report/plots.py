@@ -205,9 +205,10 @@ def draw_correlation(result: FitResult):
     axis.set_yticks(range(shown), names[:shown])
     for i in range(shown):
         for j in range(shown):
-            if np.isfinite(mean[i, j]) and shown <= 12:
+            if shown <= 12:
                 dark = "w" if abs(mean[i, j]) > 0.6 else "k"
-                axis.text(j, i, f"{mean[i, j]:.2f}", ha="center", va="center", color=dark, size=7)
+                text = f"{mean[i, j]:.2f}" if np.isfinite(mean[i, j]) else "none"
+                axis.text(j, i, text, ha="center", va="center", color=dark, size=7)
     title = "correlation" + (f", mean of {result.lanes} fits" if result.lanes > 1 else "")
     axis.set_title(title + of_all(shown, len(names), "unknowns"))
     bar = figure.add_axes(

@@ -38,13 +38,15 @@ from jaxtrachea.mechanics.oblique import Place, place_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.landing import Landing, axes_at, landing
+from jaxtrachea.scene.needs import DRAGS, PLANNED
 from jaxtrachea.scene.ranges import half_spacing
 from jaxtrachea.scene.refusals import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 
-#: Way along the surface that an anchor holds, over the depth.
-MAX_SLIDE = 1.0
+#: Way along the surface that an anchor holds, over the depth; the same of several tools off the
+#: midline: their plan takes twice that (`needs.drags`), of a press half as long (`MAX_MISMATCH`).
+MAX_SLIDE, MAX_DRAG = 1.0, DRAGS * PLANNED
 #: Largest difference of the anchor's press and the tool's depth, over the depth.
 MAX_MISMATCH = 0.5
 #: Least normal force, over that of a press straight in.
@@ -261,7 +263,9 @@ def re_anchor(scene: Scene, anchor: Anchor, way: Float[Array, "3"], path: Poses)
 
 def largest_slide(scene: Scene, depth):
     """Way along the surface that an anchor holds at this depth, mm."""
-    return jnp.minimum(MAX_SLIDE * depth, SPACING_SHARE * half_spacing(scene))
+    several = scene.plan.tools != "one" and scene.plan.second_plane
+    most = MAX_DRAG if several else MAX_SLIDE
+    return jnp.minimum(most * depth, SPACING_SHARE * half_spacing(scene))
 
 
 def _to_mesh(scene: Scene, s, vector):

@@ -3,10 +3,10 @@
 import dataclasses
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea.files.traces import Traced
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.levels.relaxing import long_run
 from jaxtrachea.scene.approach import first_touch
@@ -48,7 +48,7 @@ def facts_of(
     """
     curved = scene.mesh is not None and scene.mesh.frames is not None
     if isinstance(path, Poses):
-        seen = _touched(_what_is_touched(scene, curved), _filled_up(path))
+        seen = _TOUCHED(_what_is_touched(scene, curved), _filled_up(path))
         rows = len(path.translation)
         s, phi, touching, moved = (np.asarray(v)[:rows] for v in seen[:4])
         s, phi, moved = (np.asarray(v, float) for v in (s, phi, moved))
@@ -161,7 +161,6 @@ def _filled_up(path: Poses) -> Poses:
     return Poses(np.asarray(path.rotation)[filled], np.asarray(path.translation)[filled])
 
 
-@jax.jit
 def _touched(
     scene: Scene, path: Poses
 ) -> tuple[
@@ -183,6 +182,10 @@ def _touched(
     touching, row = first_touch(seen, in_lumen(scene, path, seen))
     place = landing(scene, path, seen, row)
     return seen.s, seen.phi, touching, place.way, row, seen.gap, (place.s, place.phi)
+
+
+#: Paths of any length share its program, and other starts its trace.
+_TOUCHED = Traced(_touched)
 
 
 def _near(scene: Scene, s, phi) -> bool:

@@ -4,12 +4,10 @@ import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.contact.pose import pose_from_vector
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.scene.spec_parts import PathSection
 from jaxtrachea.scene.stage import Poses, Presses
@@ -57,14 +55,16 @@ def _path(
     geometry: Geometry,
 ) -> Poses | Presses:  # fmt: skip
     """The path of one tool; its legs by their place in the file."""
+    from scipy.spatial.transform import Rotation
+
     if spec.path[0].kind == "press":
         reach = 0.0 if spec.effects.width == "point" else spec.model.half_width
         return _presses(legs, geometry, reach)
     *found, own = zip(*(_leg(leg, i, folder, files) for i, leg in legs.items()), strict=True)
     translation, vectors = (np.concatenate(v) for v in found)
-    turn = jax.vmap(lambda v: pose_from_vector(v, jnp.zeros_like(v)).rotation)
     time = _times(legs, [len(v) for v in found[0]], own)
-    return Poses(turn(jnp.asarray(vectors)), jnp.asarray(translation), time)
+    turn = Rotation.from_rotvec(vectors).as_matrix()
+    return Poses(jnp.asarray(turn), jnp.asarray(translation), time)
 
 
 def _times(

@@ -151,7 +151,7 @@ def draw_map(s, phi, values: np.ndarray, label: str) -> Figure:
         values: shape (s, phi).
         label: with its unit.
     """
-    figure = Figure(figsize=(7, 2.8), dpi=110)
+    figure = Figure(figsize=(7, 3.2), dpi=110)
     axis = figure.subplots()
     image = axis.pcolormesh(s, np.degrees(phi), values.T, shading="nearest", cmap="cividis")
     axis.set(xlabel="s [mm], carina to larynx", ylabel="phi [deg]")
@@ -160,13 +160,15 @@ def draw_map(s, phi, values: np.ndarray, label: str) -> Figure:
     return figure
 
 
-def draw_sweep(s, phi, out: Sweep) -> dict[str, Callable[[], Figure]]:
-    """What draws maps of force and compliance, by file name."""
+def draw_sweep(s, phi, depth: float, out: Sweep) -> dict[str, Callable[[], Figure]]:
+    """What draws maps of force and compliance at a depth, mm, by file name."""
 
     def grid(v):
         return np.asarray(v).reshape(len(s), len(phi))
 
     return {
-        "force.png": partial(draw_map, s, phi, grid(out.force), "force [N]"),
-        "compliance.png": partial(draw_map, s, phi, grid(out.compliance), "compliance [mm/N]"),
+        "force.png": partial(draw_map, s, phi, grid(out.force), f"force at {depth:g} mm [N]"),
+        "compliance.png": partial(
+            draw_map, s, phi, grid(out.compliance), f"compliance at {depth:g} mm [mm/N]"
+        ),
     }

@@ -107,8 +107,8 @@ def draw_surface(
     prints = [own for own in prints if own is not None]
     outline = np.concatenate(prints) if prints else None
     _draw_view(view, wall, rest, tool, contacts, moved / top, rings, outline)
-    if out.joints is not None:
-        _draw_joints(view, scene, mesh, vertices, contact, (low, high))
+    joints = out.joints is not None
+    joints = joints and _draw_joints(view, scene, mesh, vertices, contact, (low, high))
     _draw_across(across, Triangles(vertices, near), rest, tool, contact)
     _draw_length(length, Triangles(vertices, near), rest, tool, contacts, along, rings)
     scale = figure.colorbar(
@@ -117,7 +117,7 @@ def draw_surface(
     )  # fmt: skip
     scale.set_label("displacement of the wall [mm]", fontsize=8, labelpad=2)
     scale.ax.tick_params(labelsize=8)
-    _legend(figure, tool is not None, outline, out.joints is not None, contact)
+    _legend(figure, tool is not None, outline, joints, contact)
     lines = [plain(line, 90) for line in textwrap.wrap(title, 88)[:2]]
     figure.text(0.015, 0.985, "\n".join(lines), ha="left", va="top", fontsize=11)
     figure.text(
@@ -370,21 +370,22 @@ def _draw_scale(axis: Any, camera: np.ndarray, frame: np.ndarray, low, high) -> 
     for name, way in zip(("to the larynx", "anterior", "lateral (z)"), ways, strict=True):
         axis.annotate("", origin + way, origin, zorder=6, arrowprops=arrow)
         end = origin + way * (1 + 1.5 / max(np.linalg.norm(way), 1.5))
-        ha = "left" if way[0] > 1.5 else "right" if way[0] < -1.5 else "center"
+        ha = "left" if way[0] > -0.1 else "right"  # of two steep ones each has its side
         va = "center" if abs(way[0]) > 1.5 else ("bottom" if way[1] > 0 else "top")
         axis.text(*end, name, fontsize=7.5, color="0.25", ha=ha, va=va)
 
 
-def _draw_joints(axis: Any, scene: Scene, mesh: Mesh, vertices, contact, ends) -> None:
-    """Joints on the anterior midline, where it faces the viewer."""
+def _draw_joints(axis: Any, scene: Scene, mesh: Mesh, vertices, contact, ends) -> bool:
+    """Joints on the anterior midline, where it faces the viewer; whether it does."""
     camera = _camera(contact.axes)
     if camera[2] @ contact.frame[:, 1] < 0.05:
-        return
+        return False
     for s in np.asarray(scene.geometry.ring_positions, float):
         if ends[0] < s < ends[1]:
             which, weight = _nearest(mesh, s, 0.0)
             place = camera @ (weight @ vertices[which])
             axis.plot(*place[:2], "D", color="w", mec="k", mew=0.7, ms=3.2, zorder=5)
+    return True
 
 
 def _section(surface: Triangles, point: np.ndarray, normal: np.ndarray, axes: np.ndarray):

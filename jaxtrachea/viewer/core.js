@@ -167,7 +167,7 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
     option.tool = k; tool = tools[k].mesh; corners = tools[k].corners;
     const box = panel.querySelector("[data-option=tool]");
     if (box) box.value = k;
-    tell(); dirty = true;
+    tell(); dirty = true; onPose(k, pose());
   }
 
   function paint() {
@@ -386,10 +386,10 @@ export function mount(T, Orbit, el, scene, { onPose = () => {}, movable = true }
       label.style.top = `${Math.min(Math.max(((1 - p.y) / 2) * h + 14, 60), h - 70)}px`;
     }
   }
-  function look() {
-    const p = tool.position;
-    orbit.target.set(p.x, middle.y, middle.z);
-    camera.position.set(p.x - 0.8 * size, middle.y + 1.3 * size, middle.z + 2.6 * size); orbit.update(); dirty = true;
+  function look() { // at all of the tube
+    const far = size * Math.min(Math.max((1.5 * el.clientHeight) / el.clientWidth || 1, 0.85), 3);
+    orbit.target.copy(middle);
+    camera.position.set(-0.8, 1.3, 2.6).multiplyScalar(far).add(middle); orbit.update(); dirty = true;
   }
   function screen(p = tool.position) {
     const q = p.clone().project(camera), b = renderer.domElement.getBoundingClientRect();

@@ -37,6 +37,7 @@ class Live(Worker):
         frame: the last one; None: none yet.
         steps: the last steps, without their vertices.
         recording: frames that are kept; None: nothing is recorded.
+        in_hand: the tool that was moved last.
     """
 
     def __init__(self, path: Path, set_up: Callable[[], None] = lambda: None):
@@ -54,6 +55,7 @@ class Live(Worker):
         self.frame: Frame | None = None
         self.steps: list[Frame] = []
         self.recording: list[Frame] | None = None
+        self.in_hand = 0
         self._values: dict[str, float] = {}
         self._poses = np.zeros((0, 12))
         self._fresh = self._reset = False
@@ -62,7 +64,7 @@ class Live(Worker):
     def move(self, pose: np.ndarray, tool: int = 0) -> None:
         """Move a tool: rotation by rows, then translation, mm; shape (12,)."""
         with self._wake:
-            self._poses[tool], self._fresh = pose, True
+            self._poses[tool], self._fresh, self.in_hand = pose, True, tool
             self._wake.notify()
 
     def set_value(self, name: str, value: float) -> None:
@@ -102,7 +104,7 @@ class Live(Worker):
         self.packet = tools_packet(
             handled.title, handled.names, handled.tools, handled.poses, tube_arrays(*tube_of(scene))
         )
-        self.tell("compiling", "compiling the scene")
+        self.tell("compiling", "compiling the scene: up to a minute the first time, seconds later")
         session = handled.session()
         self.sliders = sliders(_long_run(session.material), scene.plan)
         # The first step also loads what runs at the first step only.

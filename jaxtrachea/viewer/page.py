@@ -55,6 +55,7 @@ class ScenePage(Page):
         super().__init__(live)
         self.live = live
         self.shown: object = None
+        self.place: list[float] = []
 
     def ready(self) -> None:
         """What there is once the scene is compiled."""
@@ -88,17 +89,16 @@ class ScenePage(Page):
                 ui.button("values as TOML", on_click=self.save_values).props(f"{SMALL} id=toml")
 
     def position(self) -> None:
-        """Three numbers to type, and the way back to the start."""
-        start = self.live.handled.poses[0, 9:]
+        """Three numbers to type, which follow the tool in hand, and the way back to the start."""
         with ui.row().style("gap:6px;align-items:center;flex-wrap:nowrap"):
-            boxes = [
-                ui.number(f"{axis} [mm]", value=float(v), format="%.3f", min=-1e3, max=1e3)
+            self.boxes = [
+                ui.number(f"{axis} [mm]", format="%.3f", min=-1e3, max=1e3)
                 .style("width:76px").props(f"dense id=place-{axis}")
-                for axis, v in zip("xyz", start, strict=True)
+                for axis in "xyz"
             ]  # fmt: skip
 
             def go() -> None:
-                typed = [float(box.value) for box in boxes if box.value is not None]
+                typed = [float(box.value) for box in self.boxes if box.value is not None]
                 if len(typed) == 3:
                     self.wall.run_method("place", *typed)
 
@@ -139,10 +139,16 @@ class ScenePage(Page):
         self.draw()
 
     def draw(self) -> None:
-        """Force over depth of the last steps that have a force, where there is a new one."""
-        if self.live.frame is self.shown:
+        """Where the tool is, and force over depth of the last steps that have a force."""
+        frame = self.live.frame
+        if frame is None or frame is self.shown:
             return
-        self.shown = self.live.frame
+        self.shown = frame
+        place = [float(v) for v in frame.touches[self.live.in_hand].pose[9:]]
+        if place != self.place:
+            for box, v in zip(self.boxes, place, strict=True):
+                box.set_value(v)
+            self.place = place
         for k, series in enumerate(self.chart.options["series"]):
             touches = [f.touches[k] for f in self.live.steps[-300:] if f.has_force(k)]
             series["data"] = [[t.depth, float((t.force**2).sum() ** 0.5)] for t in touches]

@@ -18,6 +18,7 @@ WIDE, NO_ENDS = 30, {"showMinLabel": False, "showMaxLabel": False}
 #: Samples a second.
 SPEEDS = {1: "1 a second", 10: "10 a second", 100: "100 a second", 1e6: "as fast as it goes"}
 ORDERS = {False: "as recorded", True: "as proposed"}
+LINES = "Dark: estimate; orange: ends of the 95 % interval; dotted: a new press, and its place."
 COLUMNS = ("parameter", "estimate", "95 % interval", "verdict")
 
 
@@ -60,6 +61,7 @@ class StreamPage(Page):
             self.message = ui.label().style("color:#a04000").props("id=message")
             columns = [{"name": c, "label": c, "field": c, "align": "left"} for c in COLUMNS]
             self.table = ui.table(columns=columns, rows=[]).props("dense id=estimates")
+            ui.label(LINES).style("font-size:12px;color:#555")
             with ui.row().style("gap:12px"):
                 self.charts = [self.chart(label) for label in self.labels()]
         self.draw()
@@ -73,18 +75,18 @@ class StreamPage(Page):
 
     def chart(self, label: str) -> ui.echart:
         """Of one unknown: estimate and both ends of its interval."""
-        styles = {"estimate": "solid", "low": "dashed", "high": "dashed"}
+        colours = {"estimate": "#1d3557", "low": "#d9782d", "high": "#d9782d"}
         lines = [
-            {"name": name, "type": "line", "showSymbol": False, "data": [], "color": "#1d3557",
-             "lineStyle": {"type": style, "width": 2 if style == "solid" else 1}}
-            for name, style in styles.items()
+            {"name": name, "type": "line", "showSymbol": False, "data": [], "color": colour,
+             "lineStyle": {"width": 2 if name == "estimate" else 1}}
+            for name, colour in colours.items()
         ]  # fmt: skip
-        lines[0]["markLine"] = {"symbol": "none", "silent": True, "data": [],
-                                "lineStyle": {"color": "#999", "type": "dotted"},
-                                "label": {"formatter": "{b}", "fontSize": 10}}  # fmt: skip
+        label = {"formatter": "{b}", "fontSize": 10, "distance": 8}
+        lines[0]["markLine"] = {"symbol": "none", "silent": True, "data": [], "label": label,
+                                "lineStyle": {"color": "#999", "type": "dotted"}}  # fmt: skip
         return ui.echart({
             "animation": False, "title": {"text": label, "textStyle": {"fontSize": 13}},
-            "grid": {"left": 64, "right": 16, "top": 44, "bottom": 40},
+            "grid": {"left": 64, "right": 16, "top": 52, "bottom": 40},
             "xAxis": {"type": "value", "name": "samples", "nameLocation": "middle", "nameGap": 24},
             "yAxis": {"type": "value"}, "series": lines,
         }).style("height:230px;width:400px")  # fmt: skip
@@ -152,7 +154,7 @@ class StreamPage(Page):
         if kind == "log":
             low, high = 10 ** np.floor(np.log10(low)), 10 ** np.ceil(np.log10(high))
         ends = {"min": float(low), "max": float(high)} if high > low else {}
-        # A dashed line to a point far outside keeps a browser busy for minutes.
+        # Points far outside lie just beyond the ends, above 0 on an axis of logarithms.
         room = (low / 10, high * 10) if kind == "log" else (2 * low - high, 2 * high - low)
         lines = np.clip(lines, *room) if ends else lines
         chart.options["yAxis"] = {"type": kind, "scale": True, "axisLabel": NO_ENDS, **ends}

@@ -102,10 +102,10 @@ def without(address):
             pose = [1, 0, 0, 0, 1, 0, 0, 0, 1, 60, 15.5 + 0.01 * (i % 2), 0]
             begin = time.perf_counter()
             link.send('"drawn"')
-            link.send(json.dumps({"pose": pose}))
+            link.send(json.dumps({"tool": 0, "pose": pose}))
             head = np.frombuffer(link.recv()[:40], np.float32)
             whole.append(1e3 * (time.perf_counter() - begin))
-            steps.append(float(head[9]))
+            steps.append(float(head[1]))
     return {"server ms": float(np.median(whole)), "step ms": float(np.median(steps))}
 
 

@@ -27,11 +27,14 @@ FLAGS = [
 class Browser:
     """One window; `requests`: the addresses that it asked for, `errors`: its complaints."""
 
-    def __init__(self, width=1280, height=760):
-        """Start it; the window is empty."""
+    def __init__(self, width=1280, height=760, downloads=None):
+        """Start it; the window is empty. `downloads`: a folder for what pages save."""
         self._open = contextlib.ExitStack()
         try:
             self._start(width, height)
+            if downloads is not None:
+                self._ask("Browser.setDownloadBehavior", behavior="allow",
+                          downloadPath=str(downloads))  # fmt: skip
         except BaseException:
             self.close()
             raise

@@ -128,9 +128,9 @@ def test_facts_of_paths_of_any_length_are_one_program():
     short, long = (ball([75, 1, 0], [76, -2, 0], rows) for rows in (3, 61))
     plans = [make_scene(TUBE, SPRINGS, p, tool=BALL, effects=BARE).plan for p in (short, long)]
     assert plans[0] == plans[1]
-    before = scene_facts._touched._cache_size()
+    before = scene_facts._TOUCHED._plain._cache_size()
     make_scene(TUBE, SPRINGS, ball([75, 1, 0], [76, -2, 0], 40), tool=BALL, effects=BARE)
-    assert scene_facts._touched._cache_size() == before
+    assert scene_facts._TOUCHED._plain._cache_size() == before
 
 
 def test_an_array_that_its_owner_changes_later_leaves_the_path():

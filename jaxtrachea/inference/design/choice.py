@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -60,9 +59,8 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     parts = []
     curve = np.zeros(len(candidates.s), int) if candidates.curve is None else candidates.curve
     for g, k in enumerate(known.lane):
-        blend = None if known.blend is None else jnp.asarray(known.blend[g])
-        theta, approach = jnp.asarray(known.theta[g]), jnp.asarray(known.approach[k])
-        guess = Guess(theta, study.lanes.value[k, 0], blend, approach)
+        blend = None if known.blend is None else known.blend[g]
+        guess = Guess(known.theta[g], study.lanes.value[k, 0], blend, known.approach[k])
         index = index_of_presses(study, int(k), curve)
         of = candidates
         place = Place(of.s, of.depth, of.phi, index, of.speed, of.hold)

@@ -108,10 +108,10 @@ class Guess(NamedTuple):
         approach: how long before first touch the record begins, mm.
     """
 
-    theta: Float[Array, " P"]
+    theta: Any
     value: Any
-    blend: Float[Array, ""] | None
-    approach: Float[Array, ""]
+    blend: Any
+    approach: Any
 
 
 class Place(NamedTuple):
@@ -148,7 +148,7 @@ def press_informations(
     parts = []
     for first in range(0, count, together):
         row = np.minimum(np.arange(first, first + together), count - 1)
-        place = Place(*(None if v is None else jnp.asarray(v[row]) for v in places))
+        place = Place(*(None if v is None else v[row] for v in places))
         parts.append(np.array(run(guess, place))[: count - first])
     return np.concatenate(parts)
 
