@@ -163,6 +163,12 @@ class Study:
         """
         return first_touch_of(self.lanes, self.parameters, self.change_points)
 
+    @property
+    def takes_zeros(self) -> Bool[np.ndarray, " lanes"]:
+        """Lanes of which a curve takes an onset, force offset or slope that is `auto`."""
+        columns = [j for j, p in enumerate(self.parameters) if p.auto and not p.fixed]
+        return np.any(self.lanes.index[..., columns] >= 0, axis=(1, 2))
+
     @functools.cached_property
     def unknown_columns(self) -> Int[np.ndarray, "lanes P"]:
         """Which of `free` every unknown is; -1 where a lane has fewer unknowns."""
