@@ -192,7 +192,7 @@ def _columns(result: FitResult, lanes: Int[np.ndarray, " n"], theta, study: Stud
     def values(study: Study, theta) -> np.ndarray:
         return map_lanes(
             residual_value, study, theta, batch=batch,
-            unoptimised=study.unoptimised(result.lanes),
+            unoptimised=study.evaluates_few(result.lanes),
         )  # fmt: skip
 
     base = values(study, theta)

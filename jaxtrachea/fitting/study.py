@@ -255,13 +255,17 @@ class Study:
         return batching.batch_size(total, min(most, self.max_batch))
 
     def unoptimised(self, count: int) -> bool:
-        """Whether `count` lanes take less time than it takes to optimise their program.
+        """Whether `count` starts take less time than it takes to optimise their program.
 
         Joint studies run theirs again and again.
         """
         if self.joint or self.one_at_a_time or not batching.on_cpu():
             return False
         return not batching.worth_optimising(count, self.bytes_per_lane)
+
+    def evaluates_few(self, count: int) -> bool:
+        """As `unoptimised`, of `count` lanes that are evaluated a few times and not solved."""
+        return self.unoptimised(-(-count // batching.EVALUATIONS))
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""
