@@ -93,6 +93,21 @@ def test_curves_without_air_keep_their_fit(mixed):
     assert not np.isnan(result.table().rows[-1]["value"])
 
 
+def test_lanes_without_zeros_are_fitted_as_by_themselves(mixed, monkeypatch):
+    """Where others take zeros: by a model that has them, or by one without."""
+    *_, result = mixed
+    takes, settings = result.study.takes_zeros, Settings(starts=2)
+    assert 0 < takes.sum() < len(takes)
+    study = result.study.take(np.arange(len(takes)))
+    together = fit(study, settings)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.MANY_WITHOUT", 1)
+    apart = fit(study, settings)
+    assert np.isnan(apart.uncertainty.dispersion[~takes, 3:]).all()  # a model without zeros
+    for name in ("value", "standard_error", "evidence_low", "cost", "sigma", "status", "minima"):
+        one, other = getattr(apart, name), getattr(together, name)
+        np.testing.assert_allclose(one, other, rtol=1e-6, err_msg=name)
+
+
 def test_notes_name_curve_and_value(mixed):
     _, plain, result = mixed
     assert sentences_of_fits(plain.study, plain.value) == []

@@ -404,7 +404,8 @@ def test_little_work_is_compiled_without_optimisation(monkeypatch):
     D = np.linspace(0.1, 2, 20)
     study = build_study([Curve("A", "t", 75.0, 0.0, D, D)], table_1(), Options(contact="bonded"))
     on_cpu = jax.default_backend() == "cpu"
-    assert [study.unoptimised(n) for n in (1, 16, 64, 65, 10_000)] == [on_cpu] * 3 + [False] * 2
+    assert [study.unoptimised(n) for n in (1, 16, 256, 257, 10_000)] == [on_cpu] * 3 + [False] * 2
+    assert [study.evaluates_few(n) for n in (1, 4096, 4097)] == [on_cpu] * 2 + [False]
     long = study.lanes._replace(force=np.zeros((1, 1, 200_000)))
     assert not replace(study, lanes=long).unoptimised(1)
     assert not replace(study, joint=True).unoptimised(1)

@@ -4,6 +4,8 @@ import csv
 import dataclasses
 
 import h5py
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import specimens
@@ -11,8 +13,8 @@ from scipy.special import stdtrit
 from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
 from jaxtrachea.files.table import Table
+from jaxtrachea.fitting import other_starts, verify
 from jaxtrachea.fitting import structure as structures
-from jaxtrachea.fitting import verify
 from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.build import build_study, default_parameters
 from jaxtrachea.fitting.fit import fit
@@ -21,12 +23,13 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.press import Options, compliance
 from jaxtrachea.report.tables import estimate_table, spread_table
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.rows import lane_rows, parameter_rows
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.material import Material
 
 GEOMETRY = table_1()
 RINGS, LENGTH = np.asarray(GEOMETRY.ring_positions), float(GEOMETRY.length)
@@ -126,6 +129,34 @@ def test_a_twin_skeleton_belongs_to_the_interval(result, pressed):
     assert np.all(word[4, :2] == "practically non-identifiable")
     assert not outside[4, :2].any()
     assert result.minima[4] > 1
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("GA_L", [None, 50.0])
+@pytest.mark.parametrize("best", [2.0, 11.0])
+def test_other_skeletons_are_as_soft_as_the_beam_says(GA_L, best):
+    """On grids whole and cut by a bound; without shear a line through the grid is enough."""
+    geometry, options = table_1(), Options(shear=GA_L is not None)
+    D = np.linspace(0, 1, 9)
+    curves = [Curve("a", str(s), s, 0.0, D, D) for s in (30.0, 80.0)]
+    given = {} if GA_L is None else {"GA_L": {"fixed": True, "value": GA_L}}
+    study = build_study(curves, geometry, options, given)
+    names = [p.name for p, _, _ in study.unknowns[0]]
+    beam = np.array([[names.index("EI_L"), names.index("k_M")]])
+    theta, lanes = np.zeros((1, study.size)), np.array([0])
+    theta[0, beam[0]] = best, 0.5
+    axes = other_starts._axes(study, lanes, theta, beam)
+    change = other_starts._softer(study, lanes, theta, beam, axes)
+
+    @jax.vmap
+    def softness(ln):
+        EI, k = jnp.exp(ln)
+        wall = Material(EI, k, 1.0, 0.0, GA_L=GA_L)
+        return jnp.log(compliance(geometry, wall, np.array([30.0, 80.0]), options))
+
+    grid = np.stack(np.meshgrid(*axes[0], indexing="ij"), axis=-1).reshape(-1, 2)
+    expected = jax.jit(softness)(grid) - softness(theta[:, beam[0]])
+    np.testing.assert_allclose(change.reshape(-1, 2), expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

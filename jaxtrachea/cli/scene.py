@@ -98,7 +98,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
         with progress_bar(transient=True) as bar:
             stages = Stages(bar, stop_if_asked)
             stages.begin(f"pressing {_rows(staged)} rows; a new kind of scene is compiled first")
-            out = jax.block_until_ready(Traced(run)(staged.scene, staged.material, staged.path))
+            out = jax.device_get(Traced(run)(staged.scene, staged.material, staged.path))
             clock.append(time.perf_counter())
             stop_if_asked()
             stages.begin("drawing and writing")

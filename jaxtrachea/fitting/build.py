@@ -39,7 +39,7 @@ from jaxtrachea.fitting.parameters import (
 from jaxtrachea.fitting.refusals import Size, as_read, check_noise, depths, refusal
 from jaxtrachea.fitting.relaxing import by_records, span_of, with_span
 from jaxtrachea.fitting.study import Recipe, Study, first_touch_of
-from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
+from jaxtrachea.fitting.zeros import resolved, starts_of, without_flat_line
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.measurements.record_zeros import Zeros
 from jaxtrachea.mechanics.levels.choose import level_of
@@ -119,6 +119,40 @@ def with_zeros(study: Study, asked: Taken) -> Study:
     return with_recipe(again, holdout_groups=study.holdout_groups)
 
 
+def without_zeros(study: Study) -> Study:
+    """A study of lanes that take no zero which is `auto`, by the model of one in which none does.
+
+    Args:
+        study: lanes of one in which others take some.
+    """
+    free = [
+        dataclasses.replace(p, fixed=True, step=DEFAULTS[p.name].step)
+        if p.auto and not p.fixed
+        else p
+        for p in study.parameters
+    ]
+    parameters = without_flat_line(free)
+    columns = [j for j, p in enumerate(free) if p in parameters]
+    P = max(map(len, study.unknowns))
+    lanes = study.lanes._replace(
+        value=study.lanes.value[..., columns],
+        index=study.lanes.index[..., columns],
+        **{name: getattr(study.lanes, name)[:, :P] for name in ("lower", "upper", "active")},
+    )
+    seen = study.change_points
+    if not onset_is_sought(parameters, study.model.options):
+        lanes, seen = lanes._replace(blend=None), None
+    model = dataclasses.replace(
+        study.model,
+        columns=columns_of(parameters),
+        common=_common([list(lane) for lane in study.unknowns], parameters, {}),
+    )
+    return dataclasses.replace(
+        study, model=model, parameters=parameters, lanes=lanes, change_points=seen,
+        record_zeros=None,
+    )  # fmt: skip
+
+
 def with_recipe(study: Study, **changes: Any) -> Study:
     """The study with changes that its lanes do not depend on, and its recipe."""
     out = dataclasses.replace(study, **changes)
@@ -161,7 +195,7 @@ def _built(curves: Sequence[Curve], recipe: Recipe, before: Study | None = None)
     model = FitModel(
         tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
         loss=weighting.loss, loss_scale=float(weighting.loss_scale),
-        common=_common(unknowns, parameters, own),
+        common=_common(unknowns, parameters, own.taken),
     )  # fmt: skip
     study = Study(
         model=model,
@@ -293,12 +327,12 @@ def _table(
     return default_parameters(names, changes, defaults_of(options, geometry))
 
 
-def _common(unknowns, parameters, own: Resolved) -> Common:
+def _common(unknowns, parameters, taken: Taken) -> Common:
     """See `FitModel.common`."""
     free = [p.name for p in parameters if not p.fixed]
     auto = {p.name for p in parameters if not p.fixed and p.auto}
     names = [[p.name for p, _, _ in lane] for lane in unknowns]
-    if all(lane == free for lane in names) and all(auto <= v for v in map(set, own.taken.values())):
+    if all(lane == free for lane in names) and all(auto <= v for v in map(set, taken.values())):
         return "all"
     beams = ([name for name in lane if name in SKELETON] for lane in names)
     return "beam" if all(len(b) == len(set(b)) for b in beams) else "nothing"

@@ -102,6 +102,7 @@ def descend(
         outcome = map_lanes(
             _descend, study, starts, sigma[rows], rows=rows, batch=min(batch, len(rows)),
             static=(descent,), dtype=dtype, progress=progress,
+            unoptimised=study.unoptimised(len(rows)),
         )  # fmt: skip
     theta, value, status, iterations = outcome
     return Solved(theta, value, status.astype(int), iterations)

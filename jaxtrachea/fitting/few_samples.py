@@ -7,12 +7,14 @@ from jaxtyping import Int
 
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.batching import UNOPTIMISED_LANES, on_cpu
+from jaxtrachea.optimisation.batching import on_cpu
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
 #: Samples kept of a curve, and how many times as many the longest of a study has at least.
 KEPT, TIMES = 48, 2
+#: Starts up to which compiling one more program takes longer.
+MOST_WHOLE = 64
 #: Width of the cells, in scaled coordinates, in which starts of a lane have come to the same point.
 SAME = 1e-3
 
@@ -28,7 +30,7 @@ def serves(study: Study, settings: Settings, starts: int) -> bool:
     measured, go their own way.
     """
     lanes, model = study.lanes, study.model
-    long = lanes.force.shape[-1] >= TIMES * KEPT and starts > UNOPTIMISED_LANES
+    long = lanes.force.shape[-1] >= TIMES * KEPT and starts > MOST_WHOLE
     forces_alone = "joints" not in lanes.others and lanes.time is None and not model.level.iterates
     tells = forces_alone and lanes.blend is None and model.loss == "linear" and settings.verify
     solver = settings.method == "levenberg-marquardt" and not settings.float32

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.fitting.build import with_zeros
+from jaxtrachea.fitting.build import with_zeros, without_zeros
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.evaluate import evaluated
@@ -46,6 +46,8 @@ PROVEN = 1e5
 REPLACED = 3
 #: Times that a fit is made again with zeros that it asks for.
 MORE_ZEROS = 3
+#: Starts of lanes without zeros from which a program of their own takes less time than it saves.
+MANY_WITHOUT = 2048
 
 _log = logging.getLogger(__name__)
 
@@ -84,7 +86,7 @@ def fit(
     _log.info("%d fits of %d unknowns, %d starts each", lanes, study.size, settings.starts)
     if study.size == 0:
         return evaluated(study)
-    result = _without_more_zeros(study, settings, progress, starts, beside)
+    result = _by_zeros(study, settings, progress, starts, beside)
     return with_omitted_zeros(study, result, settings, progress)
 
 
@@ -114,12 +116,30 @@ def with_omitted_zeros(
         _log.info("%d curves ask for an onset or an offset; fitted again", len(asked.names))
         rows = np.flatnonzero([any(_key(c) in asked.names for c in lane) for lane in study.curves])
         new = _without_more_zeros(study.take(rows), settings, alive, None, near[rows])
-        result = merged(with_found_shares(study, result.study, rows, new.study), result, rows, new)
+        result = merged(study, result, rows, new)
     return result
 
 
 def _key(curve: Curve) -> tuple[str, str]:
     return curve.specimen, curve.trial
+
+
+def _by_zeros(study: Study, settings: Settings, progress, starts, beside) -> FitResult:
+    """As `fit`, without more zeros; many lanes that take none are fitted by a model without them.
+
+    A single record that shows one would let every lane of the study take twice as long.
+    """
+    takes = study.takes_zeros
+    rows, others = np.flatnonzero(takes), np.flatnonzero(~takes)
+    refit = starts is not None or beside is not None or study.joint
+    if refit or not len(rows) or len(others) * settings.starts < MANY_WITHOUT:
+        return _without_more_zeros(study, settings, progress, starts, beside)
+    jobs = len(takes) * settings.starts
+    alive = None if progress is None else lambda done, _: progress(done, jobs)
+    part = without_zeros(study.take(others))
+    result = _without_more_zeros(part, settings, alive, None, None)
+    new = _without_more_zeros(study.take(rows), settings, alive, None, None)
+    return merged(study, result, rows, new)
 
 
 def _without_more_zeros(study: Study, settings: Settings, progress, starts, beside) -> FitResult:

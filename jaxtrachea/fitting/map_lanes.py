@@ -35,7 +35,7 @@ def map_lanes(
         dtype: of the computation.
         progress: called with the number of rows done since the last call.
         unoptimised: whether the program is compiled without optimisation; None: as for so many
-            rows. Who calls many times with few rows has to say.
+            rows that are evaluated. Who calls many times with few rows, or solves, has to say.
 
     Returns:
         What the function returns, on the host with leading axis n; floating-point arrays in
@@ -43,7 +43,7 @@ def map_lanes(
     """
     count = len(arrays[0])
     rows = np.arange(count) if rows is None else rows
-    unoptimised = study.unoptimised(count) if unoptimised is None else unoptimised
+    unoptimised = study.evaluates_few(count) if unoptimised is None else unoptimised
     run, parts = program(function, study.model, *static, unoptimised=unoptimised), []
     for first in range(0, count, batch):
         here = np.minimum(np.arange(first, first + batch), count - 1)

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.cost import robust
 from jaxtrachea.fitting.effective import CORRELATED, lag_correlation, share_independent
+from jaxtrachea.fitting.force_share import with_found_shares
 from jaxtrachea.fitting.lane import force_entries
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.residual import residual_value
@@ -191,7 +192,7 @@ def _columns(result: FitResult, lanes: Int[np.ndarray, " n"], theta, study: Stud
     def values(study: Study, theta) -> np.ndarray:
         return map_lanes(
             residual_value, study, theta, batch=batch,
-            unoptimised=study.unoptimised(result.lanes),
+            unoptimised=study.evaluates_few(result.lanes),
         )  # fmt: skip
 
     base = values(study, theta)
@@ -380,20 +381,29 @@ _ZERO = (
 )  # fmt: skip
 
 
-def merged(study: Study, result: FitResult, rows: Int[np.ndarray, " n"], new: FitResult):
+def merged(
+    study: Study, result: FitResult, rows: Int[np.ndarray, " n"], new: FitResult
+) -> FitResult:
     """A result in which some lanes are fitted with more unknowns, the others as they were.
 
     Args:
         study: of all lanes, with these unknowns.
-        result: of all lanes without.
+        result: without them, of all lanes, or of all that are not in `rows`, in their order.
         rows: lanes of `new`.
         new: of these lanes.
     """
+    lanes, before = len(study.unknowns), result.study
+    if result.lanes < lanes:  # what stands in the place of `rows` is written over
+        place = np.cumsum(~np.isin(np.arange(lanes), rows)) - 1
+        before = before.take(place)
+    else:
+        place = np.arange(lanes)
+    study = with_found_shares(study, before, rows, new.study)
 
     def both(name, old, other):
         more = [(0, 0), *((0, b - a) for a, b in zip(old.shape[1:], other.shape[1:], strict=True))]
         blank = 0 if name in _ZERO or old.dtype == bool else -1 if old.dtype.kind == "i" else np.nan
-        out = np.pad(old, more, constant_values=blank)
+        out = np.pad(old, more, constant_values=blank)[place]
         out[rows] = other
         return out
 

@@ -17,6 +17,7 @@ from jaxtrachea.fitting.residual import inputs
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.structure import positions, without_curves
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import coefficient, power
 from jaxtrachea.optimisation.batching import batch_size, max_in_cache
 
@@ -25,6 +26,8 @@ SOFT = 19.0
 #: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
 #: (half width in natural logarithms, points of each axis).
 TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
+#: Lanes whose grids are computed together.
+TOGETHER = 32
 
 
 def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
@@ -36,7 +39,7 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     data = study.lanes
     seen = data.precision[lanes] > 0
     compliance = np.mean(
-        _compliance(result, lanes, guess[:, None])[:, 0], axis=1, where=seen.any(axis=2)
+        _compliance(study, lanes, guess[:, None])[:, 0], axis=1, where=seen.any(axis=2)
     )
     force = np.where(seen, np.abs(data.force[lanes]), 0)
     deepest = np.argmax(force, axis=2)[..., None]
@@ -64,12 +67,11 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     return out
 
 
-def _compliance(result: FitResult, lanes, theta) -> Float[np.ndarray, "n points T"]:
+def _compliance(study: Study, lanes, theta) -> Float[np.ndarray, "n points T"]:
     """Compliance at every trial of lanes, mm/N, each at many points; `theta` is (n, points, P).
 
-    The program is as for all lanes of the result: it is called for each one.
+    The program is as for all lanes of the study: it is called for a few at a time.
     """
-    study = result.study
     count, points, size = theta.shape
     bare = without_curves(study)
     read = bare.lanes._replace(others={})  # their motion is not asked for
@@ -78,7 +80,7 @@ def _compliance(result: FitResult, lanes, theta) -> Float[np.ndarray, "n points 
     batch = batch_size(TWIN_POINTS**2, max_in_cache(bare.bytes_per_lane))
     c = map_lanes(
         _felt_compliance, bare, theta.reshape(-1, size), batch=batch,
-        rows=np.repeat(lanes, points), unoptimised=study.unoptimised(result.lanes),
+        rows=np.repeat(lanes, points), unoptimised=study.unoptimised(len(study.curves)),
     )  # fmt: skip
     return c.reshape(count, points, -1)
 
@@ -97,31 +99,76 @@ def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     study = result.study
     if not {"EI_L", "k_M"} <= {p.name for p in study.free}:
         return []
+    lanes = np.asarray(lanes)
     out = np.repeat(result.theta[lanes][None], TWINS, axis=0)
-    several = positions(study) > 1
-    for n, lane in enumerate(lanes):
-        place = {p.name: i for i, (p, _, _) in enumerate(study.unknowns[lane])}
-        if not {"EI_L", "k_M"} <= place.keys() or not several[lane]:
-            continue
-        low, high, best = (v[lane] for v in (study.lanes.lower, study.lanes.upper, result.theta))
-        beam = [place["EI_L"], place["k_M"]]
-        axes = [_axis(float(best[i]), float(low[i]), float(high[i])) for i in beam]
-        mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-        theta = np.repeat(best[None], len(mesh) + 1, axis=0)
-        theta[1:, beam] = mesh
-        observed = (study.lanes.precision[lane] > 0).any(axis=1)
-        c = _compliance(result, [lane], theta[None])[0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            change = np.log(c[1:] / c[0])[:, observed]
-        misfit = np.sum(change**2, axis=1).reshape(*map(len, axes))
-        for k, cell in enumerate(_valleys(misfit)[:TWINS]):
-            out[k, n, beam] = mesh[cell]
+    names = [[p.name for p, _, _ in study.unknowns[lane]] for lane in lanes]
+    several = positions(study)[lanes] > 1
+    rows = np.array([n for n in np.flatnonzero(several) if {"EI_L", "k_M"} <= {*names[n]}], int)
+    for some in np.split(rows, range(TOGETHER, len(rows), TOGETHER)) if len(rows) else ():
+        beam = np.array([[names[n].index(name) for name in ("EI_L", "k_M")] for n in some])
+        best = result.theta[lanes[some]]
+        axes = _axes(study, lanes[some], best, beam)
+        change = _softer(study, lanes[some], best, beam, axes)
+        observed = (study.lanes.precision[lanes[some]] > 0).any(axis=2)[:, None, None]
+        misfit = np.sum(change**2, axis=3, where=observed)
+        for n, unknowns, of_lane, ends in zip(some, beam, misfit, axes, strict=True):
+            for k, cell in enumerate(_valleys(of_lane)[:TWINS]):
+                i, j = divmod(int(cell), TWIN_POINTS)
+                out[k, n, unknowns] = ends[0, i], ends[1, j]
     return list(out)
 
 
-def _axis(middle: float, low: float, high: float) -> Float[np.ndarray, " n"]:
-    """Grid of a logarithmic coordinate around the estimate, inside the bounds."""
-    return np.linspace(max(low, middle - TWIN_REACH), min(high, middle + TWIN_REACH), TWIN_POINTS)
+def _axes(
+    study: Study, lanes, best: Float[np.ndarray, "n P"], beam: Int[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 2 A"]:
+    """Grids of logarithmic coordinates around estimates, inside the bounds, in equal steps."""
+    here, middle = (lanes[:, None], beam), np.take_along_axis(best, beam, axis=1)
+    low = np.maximum(study.lanes.lower[here], middle - TWIN_REACH)
+    high = np.minimum(study.lanes.upper[here], middle + TWIN_REACH)
+    return np.linspace(low, high, TWIN_POINTS, axis=-1)
+
+
+def _softer(
+    study: Study, lanes, best: Float[np.ndarray, "n P"], beam: Int[np.ndarray, "n 2"],
+    axes: Float[np.ndarray, "n 2 A"],
+) -> Float[np.ndarray, "n A A T"]:  # fmt: skip
+    """Logarithm of the compliances on a grid of EI_L and k_M, over those of the estimates.
+
+    Where nothing but these two resists, c(EI, k) = f(EI / k) / k: a line of EI / k tells the grid.
+
+    Args:
+        study: of the fit.
+        lanes: which.
+        best: their estimates.
+        beam: where the two stand among the unknowns of each.
+        axes: of each grid, as `_axes` gives them.
+    """
+    A = axes.shape[2]
+    EI, k, step = axes[:, 0], axes[:, 1], axes[:, :, 1] - axes[:, :, 0]
+    line = EI[:, :1] + step[:, :1] * np.arange(1 - A, A)
+    along = _over_estimates(study, lanes, best, beam, line, np.repeat(k[:, :1], 2 * A - 1, axis=1))
+    steps = A - 1 + np.arange(A)[:, None] - np.arange(A)
+    out = along[:, steps] - (k - k[:, :1])[:, None, :, None]
+    # The estimate is in the middle of a grid that no bound cuts: there the line must tell 0.
+    told = np.abs(out[:, A // 2, A // 2]).max(axis=1) < 1e-9
+    rest = np.flatnonzero(~(told & (np.abs(step[:, 0] - step[:, 1]) < 1e-9)))
+    if len(rest):
+        grid = np.repeat(EI[rest], A, axis=1), np.tile(k[rest], A)
+        whole = _over_estimates(study, lanes[rest], best[rest], beam[rest], *grid)
+        out[rest] = whole.reshape(len(rest), A, A, -1)
+    return out
+
+
+def _over_estimates(
+    study: Study, lanes, best, beam, EI: Float[np.ndarray, "n m"], k: Float[np.ndarray, "n m"]
+) -> Float[np.ndarray, "n m T"]:
+    """Logarithm of compliances with EI_L and k_M in place of the estimates, over theirs."""
+    theta = np.repeat(best[:, None], 1 + EI.shape[1], axis=1)
+    row = np.arange(len(lanes))
+    theta[row, 1:, beam[:, 0]], theta[row, 1:, beam[:, 1]] = EI, k
+    with np.errstate(divide="ignore", invalid="ignore"):
+        c = np.log(_compliance(study, lanes, theta))
+        return c[:, 1:] - c[:, :1]
 
 
 def _valleys(misfit: Float[np.ndarray, "a b"]) -> Int[np.ndarray, " n"]:

@@ -26,7 +26,7 @@ def predictions(
         like: lanes of a study whose program serves; None: as many as these.
     """
     like = len(theta) if like is None else like
-    batch, unoptimised = study.batch_size(like, batch), study.unoptimised(like)
+    batch, unoptimised = study.batch_size(like, batch), study.evaluates_few(like)
     value = map_lanes(residual_value, study, theta, batch=batch, unoptimised=unoptimised)
     lanes, first = study.lanes, 0
     found: Prediction = {}

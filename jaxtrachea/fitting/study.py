@@ -163,6 +163,12 @@ class Study:
         """
         return first_touch_of(self.lanes, self.parameters, self.change_points)
 
+    @property
+    def takes_zeros(self) -> Bool[np.ndarray, " lanes"]:
+        """Lanes of which a curve takes an onset, force offset or slope that is `auto`."""
+        columns = [j for j, p in enumerate(self.parameters) if p.auto and not p.fixed]
+        return np.any(self.lanes.index[..., columns] >= 0, axis=(1, 2))
+
     @functools.cached_property
     def unknown_columns(self) -> Int[np.ndarray, "lanes P"]:
         """Which of `free` every unknown is; -1 where a lane has fewer unknowns."""
@@ -249,13 +255,17 @@ class Study:
         return batching.batch_size(total, min(most, self.max_batch))
 
     def unoptimised(self, count: int) -> bool:
-        """Whether `count` lanes take less time than it takes to optimise their program.
+        """Whether `count` starts take less time than it takes to optimise their program.
 
         Joint studies run theirs again and again.
         """
         if self.joint or self.one_at_a_time or not batching.on_cpu():
             return False
         return not batching.worth_optimising(count, self.bytes_per_lane)
+
+    def evaluates_few(self, count: int) -> bool:
+        """As `unoptimised`, of `count` lanes that are evaluated a few times and not solved."""
+        return self.unoptimised(-(-count // batching.EVALUATIONS))
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""

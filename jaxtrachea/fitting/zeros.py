@@ -65,7 +65,7 @@ def resolved(
     wanted = any(p.name == "force_slope" and not p.fixed for p in table)
     looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
     if not (wanted or looked):
-        return Resolved(_without_flat_line(table), {}, None, {})
+        return Resolved(without_flat_line(table), {}, None, {})
     zeros = zeros_of(curves, sigma, table) if zeros is None else zeros
     if wanted:
         for curve, reason in zip(curves, without_line(curves, zeros), strict=True):
@@ -92,7 +92,7 @@ def resolved(
                 recorded[curves[k].specimen, curves[k].trial].add(p.name)
         out.append(p)
     taken = {key: taken[key] | recorded[key] for key in recorded}
-    return Resolved(_without_flat_line(out), taken, zeros, recorded)
+    return Resolved(without_flat_line(out), taken, zeros, recorded)
 
 
 def zeros_of(
@@ -174,7 +174,7 @@ def _with_line(parameters: Sequence[Parameter], options: Options) -> tuple[Param
     return (*table, DEFAULTS["force_slope"]) if offset.auto else table
 
 
-def _without_flat_line(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+def without_flat_line(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """The table without a line that is held at 0: such a model has none."""
     return tuple(
         p for p in parameters if not (p.name == "force_slope" and p.fixed and p.value == 0)

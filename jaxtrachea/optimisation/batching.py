@@ -27,9 +27,9 @@ MOST_SLOTS, MOST_ELSEWHERE, PART_OF_MEMORY = 128, 1024, 0.5
 PATHS = 16
 #: Bytes of lanes that are copied for the solver at a time.
 COPIED = 1 << 28
-#: Lanes, and their bytes, up to which a program is compiled without optimisation: it takes longer
-#: to optimise than to run (docs/evidence/measured.md).
-UNOPTIMISED_LANES, UNOPTIMISED_BYTES = 64, 24 << 20
+#: Starts, and their bytes, up to which a program is compiled without optimisation: it takes longer
+#: to optimise than to run (docs/evidence/measured.md); and lanes evaluated in the time of a start.
+UNOPTIMISED_LANES, UNOPTIMISED_BYTES, EVALUATIONS = 256, 24 << 20, 16
 
 
 def on_cpu() -> bool:
