@@ -1,10 +1,9 @@
-"""The file of one program, traced and compiled; and a process that optimises such programs.
+"""The file of one traced program; and a process that optimises such programs afterwards.
 
-The compiled program is in it on a machine with one device, a CPU: to lower a trace and look for its
-program in JAX's folder takes longer than to load it. Programs of little work are compiled without
-optimisation, since the first answer is sooner so. A command that finds one again gives its file to
-a process of its own, which nobody waits for: it compiles the trace with optimisation. Later starts
-find the optimised program. One such process is at work in a folder at a time.
+Programs of little work are compiled without optimisation, since the first answer is sooner so. A
+command that finds one again gives its trace to a process of its own, which nobody waits for: it
+compiles the trace with optimisation into JAX's folder, and says so in the file. Later starts find
+the optimised program. One such process is at work in a folder at a time.
 """
 
 import contextlib
@@ -13,46 +12,17 @@ import os
 import pickle
 import subprocess
 import sys
-import threading
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-from jax import export, monitoring
-from jax.experimental.serialize_executable import deserialize_and_load, serialize
+from jax import export
 
-from jaxtrachea._compiler import quick_options
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.files.lock import Busy, NoLocks, take
 
 #: Bytes of the digest that comes before the content of a file.
 _DIGEST = hashlib.sha256().digest_size
-#: Events of JAX: a program is looked for in its folder, and found.
-_ASKED, _HIT = (
-    f"/jax/compilation_cache/{name}" for name in ("compile_requests_use_cache", "cache_hits")
-)
-
-
-class _Found(threading.local):
-    """How many programs a thread has found in JAX's folder."""
-
-    programs = 0
-
-
-_found = _Found()
-
-
-def _count(event: str, **_: object) -> None:
-    _found.programs += event == _HIT
-
-
-monitoring.register_event_listener(_count)
-
-
-def _one_cpu() -> bool:
-    """Whether programs can run on one device alone, a CPU: they are kept for no other."""
-    return jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
 class KeptTrace(NamedTuple):
@@ -63,8 +33,7 @@ class KeptTrace(NamedTuple):
         exported: the trace, by `jax.export`.
         returns: what the function returns, with the numbers of its leaves in their places.
         donated: positions of donated arguments.
-        optimised: whether the program was compiled with optimisation.
-        program: compiled, by `serialize`; None: JAX's folder alone has it.
+        optimised: whether JAX's folder has been given the optimised program.
     """
 
     name: str
@@ -72,32 +41,6 @@ class KeptTrace(NamedTuple):
     returns: Any
     donated: tuple[int, ...]
     optimised: bool = False
-    program: bytes | None = None
-
-    def load(self) -> Any:
-        """The kept program; None: there is none, or none that this machine can run."""
-        if self.program is None or not _one_cpu():
-            return None
-        try:
-            run = deserialize_and_load(*pickle.loads(zlib.decompress(self.program)))
-        except Exception:  # of another processor, say: it is compiled anew
-            return None
-        for event in (_ASKED, _HIT):
-            monitoring.record_event(event)
-        return run
-
-    def compile(self, leaves: list | None = None, *, optimised: bool) -> tuple[Any, "KeptTrace"]:
-        """The trace compiled, ready to run, and the trace with it; `leaves` as for `lower`."""
-        lowered, options = self.lower(leaves), None if optimised else quick_options()
-        before, program = _found.programs, None
-        run = lowered.compile(options)
-        # What was found in JAX's folder cannot be serialised once more: code is lost. What calls
-        # LAPACK crashes where nothing that does was lowered (findings/serialised_programs.sh).
-        alone = _found.programs == before and "custom_call" not in lowered.as_text()
-        if _one_cpu() and alone:
-            with contextlib.suppress(Exception):  # then JAX's folder alone has it
-                program = zlib.compress(pickle.dumps(serialize(run)), 1)
-        return run, self._replace(optimised=optimised, program=program)
 
     def lower(self, leaves: list | None = None) -> Any:
         """Ready for XLA; leaves: arguments, None for those that the trace was made with."""
@@ -149,7 +92,8 @@ def optimise(paths: list[Path]) -> None:
         for path in paths:
             kept = read(path)
             if kept is not None and not kept.optimised:
-                write(path, kept.compile(optimised=True)[1])
+                kept.lower().compile()
+                write(path, kept._replace(optimised=True))
     finally:
         lock.release()
 
@@ -166,7 +110,6 @@ def optimise_afterwards(paths: list[Path]) -> None:
         "JAX_ENABLE_X64": str(jax.config.values["jax_enable_x64"]),
         "JAX_COMPILATION_CACHE_DIR": str(paths[0].parent.absolute()),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_ENABLE_COMPILATION_CACHE": str(not _one_cpu()),
     }
     with contextlib.suppress(OSError):
         subprocess.Popen(

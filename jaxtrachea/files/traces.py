@@ -1,12 +1,11 @@
 """Compiled functions that the next start of a command does not trace anew.
 
 JAX keeps what XLA compiles, but a process must first trace and lower a function to know what to
-look for: of a warm start that is about half the time. Commands keep the lowered function too, and
-what it was compiled to (`kept_trace`), beside JAX's own files, under a digest of the sources of
-this package, of versions, of settings of JAX and XLA, of the function and its static arguments by
-value, and of the shapes, dtypes and static fields of the others. Where that does not tell all (a
-class from elsewhere, sources that were edited since the start), and wherever anything goes wrong,
-the function is traced as ever.
+look for: of a warm start that is about half the time. Commands keep the lowered function too,
+beside JAX's own files, under a digest of the sources of this package, of versions, of JAX's
+settings, of the function and its static arguments by value, and of the shapes, dtypes and static
+fields of the others. Where that does not tell all (a class from elsewhere, sources that were edited
+since the start), and wherever anything goes wrong, the function is traced as ever.
 
 For commands only: a program that sets constants of a module, or JAX's settings for a while, would
 be given the traces of before.
@@ -161,15 +160,12 @@ class Traced:
         found = kept is not None
         if kept is None:
             kept = self._traced(leaves, tree, device, self._donated(given[0]))
+            with contextlib.suppress(OSError):  # then the next start traces anew
+                kept_trace.write(path, kept)
         unoptimised = self._unoptimised and not kept.optimised
         if found and unoptimised:
             _found_unoptimised.append(path)
-        run = kept.load() if unoptimised or kept.optimised else None
-        if run is None:
-            run, now = kept.compile(leaves, optimised=not unoptimised)
-            if not found or now[-2:] != kept[-2:]:
-                with contextlib.suppress(OSError):  # then the next start traces anew
-                    kept_trace.write(path, now)
+        run = kept.lower(leaves).compile(quick_options() if unoptimised else None)
         structure = jax.tree.structure(kept.returns)
 
         def compiled(*arguments, **named):
@@ -273,5 +269,5 @@ def _surroundings(backend: str) -> bytes:
         for name, value in sorted(jax.config.values.items())
         if not any(word in name for word in _ELSEWHERE)
     ]
-    ours = [(k, v) for k, v in sorted(os.environ.items()) if k.startswith(("JAXTRACHEA_", "XLA_"))]
+    ours = [(k, v) for k, v in sorted(os.environ.items()) if k.startswith("JAXTRACHEA_")]
     return repr((_sources(), settings, ours, backend)).encode()
