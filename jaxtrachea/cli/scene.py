@@ -315,7 +315,8 @@ def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, st
     shown, names = (staged.scene, staged.path, out), staged.scene.names
     drawings = {"series.png": partial(draw_series, *shown)}
     if names:
-        drawings = {"series.png": partial(draw_tools, names, out)}
+        friction = [one.friction for one in staged.scene.instruments]
+        drawings = {"series.png": partial(draw_tools, names, out, friction)}
     row = last_solved(out)
     if out.vertices is not None and row is not None:
         drawings["surface.png"] = partial(draw_surface, *shown, row, title)

@@ -1,6 +1,6 @@
 """Pictures of simulations and sweeps (matplotlib without a global backend)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -68,20 +68,33 @@ def draw_series(scene: Scene, path: Poses | Presses, out: Simulation) -> Figure:
     return figure
 
 
-def draw_tools(names: list[str], out: Simulation) -> Figure:
-    """Normal force, local indentation and motion of the skeleton of several tools, row by row."""
-    figure = Figure(figsize=(9.6, 2.9), dpi=110, layout="constrained")
+def draw_tools(
+    names: Sequence[str], out: Simulation, friction: Sequence[float | None] = ()
+) -> Figure:
+    """Normal force, local indentation and motion of the skeleton of several tools, row by row.
+
+    Where they slide also the force along the surface, with its limit by the friction of each.
+    """
     row, status = np.arange(len(out.s)) + 1, np.asarray(out.status)
     inward = -np.stack([0 * out.phi, np.cos(out.phi), np.sin(out.phi)], axis=-1)
-    shown = {"normal force [N]": out.force, "indentation [mm]": out.depth,
-             "skeleton inwards [mm]": out.skeleton}  # fmt: skip
-    styles = ("-", "--", "-.", ":")
-    for axis, (label, value) in zip(figure.subplots(1, 3), shown.items(), strict=True):
-        along = np.sum(np.asarray(value, float) * inward, axis=-1)
+    force, depth, skeleton = (np.asarray(v, float) for v in (out.force, out.depth, out.skeleton))
+    normal, deep, sunk = (np.sum(v * inward, axis=-1) for v in (force, depth, skeleton))
+    shown = {"normal force [N]": normal}
+    if out.slip is not None:
+        size = np.linalg.norm(force - normal[..., None] * inward, axis=-1)
+        shown["force along the surface [N]"] = size
+    shown |= {"indentation [mm]": deep, "skeleton inwards [mm]": sunk}
+    figure = Figure(figsize=(3.2 * len(shown), 2.9), dpi=110, layout="constrained")
+    styles = ("-", "--", "-.")
+    for axis, (label, value) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
         for j, name in enumerate(names):
-            axis.plot(row, along[:, j], ls=styles[j % 4], lw=1.1, label=name, color=f"C{j % 10}")
+            color = f"C{j % 10}"
+            axis.plot(row, value[:, j], ls=styles[j % 3], lw=1.1, label=name, color=color)
             if label.startswith("normal"):
-                _draw_status(axis, row, along[:, j], status[:, j], counted=False)
+                _draw_status(axis, row, value[:, j], status[:, j], counted=False)
+            if label.startswith("force along") and friction:
+                limit = float(friction[j] or 0) * normal[:, j]
+                axis.plot(row, limit, ":", lw=0.9, color=color, label="limit of each")
         axis.set(xlabel="row", ylabel=label)
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.margins(y=0.08)

@@ -281,7 +281,11 @@ def _draw_view(axis: Any, wall, rest, tool, contacts, share, rings, outline) -> 
     if outline is not None:
         print_ = outline @ camera.T
         axis.add_collection(LineCollection(list(print_[:, :, :2]), colors="k", linewidths=1.1))
-    ends = np.concatenate([_draw_force(axis, camera, own) for own in contacts])
+    tips = np.stack([camera @ own.tip for own in contacts])[:, 0]
+    sides = [None] if len(tips) == 1 else np.where(tips >= tips.mean(), 1, -1)
+    ends = np.concatenate(
+        [_draw_force(axis, camera, *one) for one in zip(contacts, sides, strict=True)]
+    )
     low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     _frame_view(axis, camera, contact.frame, low, high)
 
@@ -338,8 +342,11 @@ def _draw_rest(axis: Any, seen: np.ndarray, faces: np.ndarray, share: np.ndarray
     )
 
 
-def _draw_force(axis: Any, camera: np.ndarray, contact: Contact) -> np.ndarray:
-    """The force as an arrow with its number, and the contact point; the ends of the arrow."""
+def _draw_force(axis: Any, camera: np.ndarray, contact: Contact, side: int | None) -> np.ndarray:
+    """The force as an arrow with its number, and the contact point; the ends of the arrow.
+
+    The number is right (1) or left (-1) of the arrow; None: where that leans.
+    """
     tip = (camera @ contact.tip)[:2]
     axis.plot(*tip, "o", color=FORCE, ms=4.5, mec="w", mew=0.8, zorder=6)
     size = float(np.linalg.norm(contact.force))
@@ -351,7 +358,8 @@ def _draw_force(axis: Any, camera: np.ndarray, contact: Contact) -> np.ndarray:
     arrow = {"arrowstyle": "-|>,head_width=0.28,head_length=0.6", "color": FORCE, "lw": 2.2}
     arrow |= {"shrinkA": 0, "shrinkB": 0}
     axis.annotate("", end, start, arrowprops=arrow, zorder=7)
-    side = 1 if (far - tip)[0] >= 0 else -1
+    if side is None:
+        side = 1 if (far - tip)[0] >= 0 else -1
     axis.text(
         *(far + (1.2 * side, 0.6)), f"{size:.3g} N", color=FORCE, fontsize=11, zorder=8,
         ha="left" if side > 0 else "right", va="bottom",
