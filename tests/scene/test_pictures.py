@@ -92,7 +92,7 @@ def test_picture_says_force_unit_and_scale(shown):
                      "contact point", "rings", "A press"):  # fmt: skip
         assert expected in words, expected
     # On the midline, which is hidden behind a tube that is pressed at its side.
-    assert ("joints" in words) == (abs(float(shown[2].phi[2])) < 1)
+    assert ("joints" in words) == (abs(float(shown[2].phi[2])) < 0.5)
     assert any("row 3 of 3: 0.4 N; the wall has moved by up to 2 mm" in w for w in words)
     assert ("tool" in words) == (shown[0].tool is not None)
     for axis in figure.axes[1:3]:
