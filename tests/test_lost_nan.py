@@ -168,7 +168,10 @@ def test_a_vertex_that_is_no_number_scales_no_dent(rows):
     def laid(off):
         def one(turn):
             near = jnp.sum((flat + off) ** 2, axis=1)
-            return trail.touching(ball, Poses(turn, at), near, flat + off, dented + off)
+            sunk, low = flat + off, dented + off
+            return sunk + trail.scale_to_touch(ball, Poses(turn, at), near, sunk, low) * (
+                low - sunk
+            )
 
         return jax.vmap(one)(jnp.tile(jnp.eye(3), (rows, 1, 1)))
 
