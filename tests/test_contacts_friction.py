@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_scenes import MATERIAL, TUBE
 
-from jaxtrachea import Coulomb, ObliqueOptions, press_contacts_path, press_path
+from jaxtrachea import Coulomb, Material, ObliqueOptions, press_contacts_path, press_path
 from jaxtrachea.mechanics.contacts import solve
 from jaxtrachea.mechanics.contacts_friction import slide_paths
 from jaxtrachea.mechanics.force_law import Law
@@ -263,6 +263,34 @@ def test_one_tool_on_the_tube_is_press_path():
         bad = run(TUBE, MATERIAL, [place], [0.2], WAY[:, None], Coulomb(mu))
         assert (np.asarray(bad.status) == status).all()
         assert np.isnan(bad.force).all()
+
+
+@pytest.mark.long
+def test_every_input_has_its_derivative():
+    """Of `press_contacts_path`: places, stiffnesses, friction and tube; lanes and float32."""
+    way = np.stack([WAY, WAY * [-1, 0.8, -1]], axis=1)
+    weights = np.random.default_rng(3).normal(size=way.shape)
+    places, mu = [63.0, 71.0, 0.2, -0.4], [0.4, 0.3]
+    x = np.array([*places, *mu, 1.86, 3.9, 13.0, 0.1, 0.4, 0.3, 0.02, 0.3, 0.7, 11.3])
+
+    def value(x):
+        names = "EI_L", "EA_L", "EI_C", "k_M", "k_t", "k_1", "k_3", "k_A", "k_B"
+        tube = dataclasses.replace(TUBE, radius=x[15])
+        tube = jax.tree.map(lambda v: v.astype(x.dtype), tube)
+        material = Material(**dict(zip(names, x[6:15], strict=True)))
+        D = jnp.asarray(way, x.dtype)
+        out = press_contacts_path(tube, material, x[:2], x[2:4], D, Coulomb(x[4:6]))
+        return jnp.sum(out.force * weights.astype(x.dtype)) + jnp.sum(out.slip[-1])
+
+    run, slopes = jax.jit(jax.vmap(value)), jax.jit(jax.grad(value))
+    by = np.asarray(slopes(x))
+    h = np.eye(16) * 1e-6 * np.maximum(np.abs(x), 0.1)
+    true = (np.asarray(run(x + h)) - np.asarray(run(x - h))) / (2 * np.diag(h))
+    size = np.maximum(np.abs(x), 0.1)
+    most = 1e-6 * np.abs(true * size).max()
+    np.testing.assert_allclose(by * size, true * size, rtol=0, atol=most)
+    single = np.asarray(run((x + h).astype(np.float32)))
+    np.testing.assert_allclose(single, run(x + h), rtol=2e-4)
 
 
 def test_what_does_not_fit_is_told():

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import epsilon, largest
 from jaxtrachea.mechanics.force_law import Law
@@ -159,7 +159,7 @@ def slide_paths(
     compliance: Float[Array, "m 3 m 3"],
     law: Law,
     friction: Coulomb,
-    height: Float[Array, " m"] | None = None,
+    lands: Bool[Array, "steps m"] | None = None,
 ) -> Slide:
     """Follow m tools side by side; see `friction.slide_path`, which this is for one tool.
 
@@ -168,18 +168,24 @@ def slide_paths(
         compliance: see `slide_together`; so for the rest.
         law: -
         friction: -
-        height: of each tool above the surface at the start, mm; None: they just touch.
+        lands: whether a tool first touches the wall at rest in the step: its way counts from there,
+            unless others have raised the wall to it before. None: all ways count from the start.
 
     Returns:
         A `Slide` with leading axes (steps, m).
     """
     none = jnp.zeros_like(displacement[0])
-    above = none[:, 0] if height is None else height
 
-    def step(before, D):
+    def step(before, row):
+        D, lands = row
+        if lands is not None:
+            anew = lands & (before.above > 0)
+            slip = jnp.where(anew[:, None], 0, before.slip)
+            before = Stand(slip, jnp.where(anew, 0, before.above), before.force)
         return slide_together(D, compliance, law, friction, before)
 
-    return jax.lax.scan(step, Stand(none[:, 1:], above, none), displacement)[1]
+    start = Stand(none[:, 1:], none[:, 0], none)
+    return jax.lax.scan(step, start, (displacement, lands))[1]
 
 
 def _has_number(status):

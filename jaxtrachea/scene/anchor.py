@@ -44,8 +44,8 @@ from jaxtrachea.scene.refusals import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 
-#: Way along the surface that an anchor holds, over the depth; the same of several tools off the
-#: midline: their plan takes twice that (`needs.drags`), of a press half as long (`MAX_MISMATCH`).
+#: Way along the surface that an anchor holds, over the depth; and that of several tools off the
+#: midline, which slide on the wall: half of what a plan without friction takes (`needs.drags`).
 MAX_SLIDE, MAX_DRAG = 1.0, DRAGS * PLANNED
 #: Largest difference of the anchor's press and the tool's depth, over the depth.
 MAX_MISMATCH = 0.5

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import full_precision, product
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
@@ -111,8 +111,7 @@ def on_one_point(
         # number stays none.
         waits = 0
         if scene.plan.friction and scene.plan.tools != "one":  # others may lift the wall to it
-            away = product(D, inward) + jnp.maximum(seen.gap, 0)
-            waits = D - away[:, None] * inward[None]
+            waits = -jnp.maximum(seen.gap, 0)[:, None] * inward[None]
         D = jnp.where((jnp.arange(rows) >= first)[:, None] | jnp.isnan(D), D, waits)
 
     def spread(v):

@@ -107,6 +107,7 @@ def make_scene(
             tube = round_wall(geometry, float(outer))
         else:
             tube = checked_walls(geometry, mesh, progress)
+    _check_friction(tools, effects)
     kinds: dict[str, Any] = {n: t.contact or effects.contact for n, t in tools.items()}
     mixed = len(set(kinds.values())) > 1
     of_all = "unilateral" if mixed else next(iter(kinds.values()))
@@ -180,6 +181,20 @@ def _named(path, tool) -> tuple[dict[str, Poses | Presses], dict[str, Tool]]:
     if not min(map(rows_of, path.values() if isinstance(path, Mapping) else [path])):
         raise ValueError("path has no rows; expected at least one")
     return paths, {n: t if isinstance(t, Tool) else Tool(t) for n, t in tools.items()}
+
+
+def _check_friction(tools: Mapping[str, Tool], effects: EffectOptions) -> None:
+    """Refuse friction of some tools alone: no rule may leave out what is given.
+
+    Raises:
+        PlanError: naming a tool that has none.
+    """
+    without = [name for name, tool in tools.items() if tool.friction is None]
+    if 0 < len(without) < len(tools) and effects.friction == "auto":
+        raise PlanError(
+            "friction", "a tool has a coefficient", f"tool {without[0]!r} has none",
+            "give each tool its friction (0: it slides freely), or set friction 'off'",
+        )  # fmt: skip
 
 
 def _check_apart(paths: Mapping[str, Poses | Presses]) -> None:

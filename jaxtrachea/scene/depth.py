@@ -37,7 +37,8 @@ def reached(case: Case) -> float:
     facts = case.facts
     fixed = case.levels["contact_point"] == "fixed" or not facts.poses
     retracted, pressed = facts.way_fixed if fixed else facts.way_per_step
-    return max(pressed, -retracted if case.options.contact == "bonded" else 0.0)
+    draws = facts.glued or case.options.contact == "bonded"
+    return max(pressed, -retracted if draws else 0.0)
 
 
 def departure(softness, way):

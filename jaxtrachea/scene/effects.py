@@ -42,15 +42,17 @@ def _contact_point(case: Case) -> Verdict:
     glued = facts.glued or case.options.contact == "bonded"
     sections = SECTIONS in facts.known
     wished = case.options.friction == "off" and "friction" not in case.finest
+    why = "what is glued stays where it touched", "use 'auto'"
+    refused = {"per_step": why} if glued else {}
     if wished and not (glued or sections):
         reason = "friction is off as you wish: every row is a frictionless press of its own"
         return Verdict("per_step", reason)
     if facts.slip < facts.spacing / 2:
         way = f"the tool moves {facts.slip:.3g} mm along the surface, less than half a ring spacing"
         hand = "" if facts.friction else "; a hand that goes on wants tool.friction, or 'per_step'"
-        return Verdict("fixed", way + hand)
+        return Verdict("fixed", way + hand, refused)
     if glued:
-        return Verdict("fixed", "glued where it touches first")
+        return Verdict("fixed", "glued where it touches first", refused)
     reason = "the tool wanders over the rings: every row is a frictionless press of its own"
     return Verdict("per_step", reason)
 

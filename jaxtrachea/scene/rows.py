@@ -41,7 +41,7 @@ class Rows(NamedTuple):
     footprint: Float[Array, " m"]
 
 
-def rows_of(
+def gather(
     scene: Scene, state: Any, paths: list[Poses], seen: list[Touch], present: Bool[Array, " m"]
 ) -> Rows:
     """Gather what each tool sees."""

@@ -63,6 +63,7 @@ def rub_paths(
     phi: Float[Array, " m"],
     presses: Sequence[Presses],
     hidden: Bool[Array, " rows"],
+    made: Sequence[Approach | None],
 ) -> Rubbed:
     """Follow all tools side by side.
 
@@ -73,11 +74,15 @@ def rub_paths(
         phi: their angles, rad.
         presses: of each tool.
         hidden: rows that are passed over.
+        made: their ways; None: presses.
     """
-    unit = influence_of(scene, material, s, phi)
+    unit, row, lands = influence_of(scene, material, s, phi), jnp.arange(len(hidden)), None
+    if firsts := [m.first for m in made if m is not None and m.first is not None]:
+        lands = row[:, None] == jnp.stack(firsts)[None]
     D = jnp.stack([_in_its_frame(p, hidden) for p in presses], axis=1)
     D = jnp.where(hidden[:, None, None], jnp.nan, smooth_touch(D, scene.plan.options))
-    return Rubbed(unit, slide_paths(D, felt(scene, unit), law_of(scene, material, s), mu_of(scene)))
+    law, mu = law_of(scene, material, s), mu_of(scene)
+    return Rubbed(unit, slide_paths(D, felt(scene, unit), law, mu, lands))
 
 
 def rub_once(

@@ -43,7 +43,7 @@ def make_plan(
     plan = Plan(
         contact=facts.poses, curved=facts.poses and facts.curved, joints=options.want_joints,
         ring_ends=options.want_ring_ends, options=model, ignored=frozenset(ignored),
-        effects=(*_path(facts), *decisions, *_asked(options)), **own,
+        effects=(*_path(facts), *decisions, *_asked(options, facts)), **own,
     )  # fmt: skip
     assert plan == plan.at(), "an effect is on without one that it needs"
     return plan
@@ -81,7 +81,7 @@ def _path(facts: SceneFacts) -> Iterator[Decision]:
         yield Decision("curved", "off", reason)
 
 
-def _asked(options: EffectOptions) -> Iterator[Decision]:
+def _asked(options: EffectOptions, facts: SceneFacts) -> Iterator[Decision]:
     """The model, and what is wanted of it."""
     series = options.coupling == "series"
     share = "indentation and skeleton share the way" if series else (
@@ -89,7 +89,8 @@ def _asked(options: EffectOptions) -> Iterator[Decision]:
     )  # fmt: skip
     yield Decision("coupling", options.coupling, share)
     pull = "no pull" if options.contact == "unilateral" else "glued"
-    yield Decision("contact law", options.contact, pull)
+    words = ("mixed", "some tools are glued") if facts.glued else (options.contact, pull)
+    yield Decision("contact law", *words)
     for name in OUTPUTS:
         wanted = getattr(options, f"want_{name}")
         yield Decision(name, *(("on", "asked for") if wanted else ("off", "not asked for")))

@@ -22,7 +22,7 @@ from jaxtrachea.scene.hold import hold
 from jaxtrachea.scene.in_time import Before, resting
 from jaxtrachea.scene.instruments import glued, touch_and_pull, touch_together, views
 from jaxtrachea.scene.memory import Memory
-from jaxtrachea.scene.rows import enter, rows_of
+from jaxtrachea.scene.rows import enter, gather
 from jaxtrachea.scene.rub_together import rub_step
 from jaxtrachea.scene.simulation import Simulation, as_simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -101,7 +101,7 @@ def move_tools(
         seen, pull = touch_together(scene, paths), None
     rubbed, total = None, None
     if scene.plan.friction:
-        rows = rows_of(scene, state, paths, seen, present)
+        rows = gather(scene, state, paths, seen, present)
         after, made, rubbed, total = rub_step(scene, long_run(material), rows, present)
         touching, known = after.touching, rows.at.known
     else:
@@ -138,7 +138,7 @@ def _hold(
     One that is not present counts as clear of the wall. How a tool holds its place does not depend
     on its shape: one program serves all that are glued, one all others.
     """
-    each, rows = views(scene), rows_of(scene, state, paths, seen, present)
+    each, rows = views(scene), gather(scene, state, paths, seen, present)
 
     def one(first, row):
         view, here, side, inside = enter(first, row)

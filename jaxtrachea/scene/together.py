@@ -127,7 +127,7 @@ def press_together(
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
     if scene.plan.friction:
         if rubbed is None:
-            rubbed = rub_paths(scene, safe, s, phi, presses, hidden)
+            rubbed = rub_paths(scene, safe, s, phi, presses, hidden, made)
         lost = jnp.isnan(jnp.sum(rubbed.slid.force, axis=(1, 2)))
         slid, hidden = without_rows(rubbed.slid, lost), hidden | lost
         solved = _Solved(rubbed.unit, slid.depth, slid.force, slid.force, slid.status)

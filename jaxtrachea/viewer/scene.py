@@ -99,12 +99,13 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
     relaxes = spec.relaxation is not None and wanted.relaxation != "off"
     if spec.model.half_width > 0:
         notes.append("width: point, since half_width is for presses straight in on the midline")
-    glued = spec.model.contact == "bonded"
-    if glued and spec.tool is None:
-        glued = False
-        notes.append("contact: unilateral, since a finger is not glued to the wall")
-    rubs = _rubs(spec)
     tools = spec.tool if isinstance(spec.tool, list) else [spec.tool]
+    own = {(tool and tool.contact) or spec.model.contact for tool in tools}
+    glued, contact = "bonded" in own, spec.model.contact
+    if glued and spec.tool is None:
+        glued, contact = False, "unilateral"
+        notes.append("contact: unilateral, since a finger is not glued to the wall")
+    rubs = _rubs(spec) and not glued
     bare = any(tool is None or tool.friction is None for tool in tools)
     if rubs and (relaxes or bare):
         rubs = False
@@ -118,7 +119,7 @@ def for_a_mouse(spec: SceneSpec) -> tuple[SceneSpec, tuple[str, ...]]:
         update={
             "effects": wanted.model_copy(update=changes),
             "output": spec.output.model_copy(update={"surface": True, "joints": False}),
-            "model": spec.model.model_copy(update={"contact": "bonded" if glued else "unilateral"}),
+            "model": spec.model.model_copy(update={"contact": contact}),
             "tool": spec.tool or _fingers(spec.names),
             "path": _far_away(spec.names, TIMES if relaxes else ()),
             "plan": None,
@@ -148,9 +149,7 @@ def _rubs(spec: SceneSpec) -> bool:
     tools = spec.tool if isinstance(spec.tool, list) else [spec.tool]
     known = any(tool is not None and tool.friction is not None for tool in tools)
     wished = spec.effects.friction != "off" and spec.effects.contact_point != "per_step"
-    return (
-        known and wished and (spec.model.contact, spec.model.coupling) == ("unilateral", "series")
-    )
+    return known and wished and spec.model.coupling == "series"
 
 
 def _words(tool: dict[str, str]) -> str:

@@ -81,8 +81,8 @@ class StreamPage(Page):
              "lineStyle": {"width": 2 if name == "estimate" else 1}}
             for name, colour in colours.items()
         ]  # fmt: skip
-        label = {"formatter": "{b}", "fontSize": 10, "distance": 8}
-        lines[0]["markLine"] = {"symbol": "none", "silent": True, "data": [], "label": label,
+        mark = {"formatter": "{b}", "fontSize": 10, "distance": 8}
+        lines[0]["markLine"] = {"symbol": "none", "silent": True, "data": [], "label": mark,
                                 "lineStyle": {"color": "#999", "type": "dotted"}}  # fmt: skip
         return ui.echart({
             "animation": False, "title": {"text": label, "textStyle": {"fontSize": 13}},

@@ -27,7 +27,8 @@ from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.status import PressStatus
 
-pytestmark = [pytest.mark.compiling, pytest.mark.long]
+pytestmark = pytest.mark.compiling
+long = pytest.mark.long
 
 OK, NO_CONTACT = PressStatus.OK, PressStatus.NO_CONTACT
 MU = {"left": 0.3, "right": 0.2}
@@ -41,11 +42,12 @@ def led(places):
 
 
 def press_and_drag(s, along, round_=0.0, deep=3.0, rows=12):
-    """Down from 0.5 mm over the tube, then along it and round it."""
+    """Down from 0.5 mm over the tube and aslant, then along it and round it."""
     t = np.linspace(0, 1, rows)
     down, side = np.clip(2 * t, 0, 1), np.clip(2 * t - 1, 0, 1)
     height = OUTER + 5.5 - (deep + 0.5) * down
-    return led(np.stack([s + along * side, height, round_ * side], axis=1))
+    aside = 0.8 * (1 - down)
+    return led(np.stack([s + along * side - aside, height, round_ * side + aside / 2], axis=1))
 
 
 PATHS = {"left": press_and_drag(62.0, 2.0), "right": press_and_drag(95.0, -1.5, 0.8)}
@@ -72,6 +74,7 @@ def row_of(paths, i):
     return {n: (np.asarray(p.rotation)[i], np.asarray(p.translation)[i]) for n, p in paths.items()}
 
 
+@long
 def test_forces_are_those_of_press_contacts_path():
     """From the first touch on; Coulomb's cone; what one drags along moves the other."""
     out = simulated()
@@ -94,8 +97,12 @@ def test_forces_are_those_of_press_contacts_path():
     assert np.abs(one.force[-1] - out.force[-1, 0]).max() > 1e-4
 
 
+@long
 def test_beside_a_tool_in_the_air_one_is_as_by_itself():
-    away = led(np.asarray(press_and_drag(95.0, -1.5).translation) + [0, 8, 0])
+    straight = np.asarray(press_and_drag(95.0, -1.5).translation)[6:]
+    away = led(np.concatenate([straight[:1] + [[0, h, 0]] for h in range(14, 8, -1)] + [
+        straight + [0, 8, 0]
+    ]))  # fmt: skip
     out = program()(MATERIAL, PATHS | {"right": away})
     alone = make_scene(TUBE, MATERIAL, PATHS["left"], tool=TOOLS["left"], mesh=MESH)
     one = jax.jit(simulate)(alone, MATERIAL, PATHS["left"])
@@ -104,9 +111,11 @@ def test_beside_a_tool_in_the_air_one_is_as_by_itself():
         got, true = np.asarray(getattr(out, name))[:, 0], np.asarray(getattr(one, name))
         np.testing.assert_allclose(got, true, rtol=0, atol=1e-13, err_msg=name)
     np.testing.assert_allclose(out.end_U, one.end_U, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(out.vertices, one.vertices, rtol=0, atol=1e-6)
+    # Off the midline each tool has its line of joints, so that round the tube it is linear twice.
+    np.testing.assert_allclose(out.vertices, one.vertices, rtol=0, atol=0.02)
 
 
+@long
 def test_the_surface_touches_both_tools_where_they_have_slid_to():
     """A vertex lies on each ball; none deeper in it than of one tool by itself (0.14 mm) or so."""
     out = simulated()
@@ -117,6 +126,7 @@ def test_the_surface_touches_both_tools_where_they_have_slid_to():
         assert gap.min() > -0.4
 
 
+@long
 def test_a_session_is_the_path_and_functional_steps_are_the_session():
     true, session = simulated(), Session(scene(), MATERIAL)
     state = init_state(scene(), MATERIAL)
@@ -140,6 +150,7 @@ def test_a_session_is_the_path_and_functional_steps_are_the_session():
     assert np.abs(lifted.force[1]).max() == 0
 
 
+@long
 def test_closed_loops_lose_what_is_told():
     """Two hands that rub round and back: the work is what friction took, to the steps' share."""
     rows = 121
@@ -184,6 +195,7 @@ def slopes():
 VALUES = np.array([1.86, 3.9, 0.3])
 
 
+@long
 def test_gradients_of_a_path_are_those_of_differences():
     by = slopes()(VALUES, PATHS)[1]
     for i, h in enumerate(np.eye(3) * 1e-6):
@@ -192,6 +204,7 @@ def test_gradients_of_a_path_are_those_of_differences():
         assert abs(by[i] - slope) < 1e-6 * max(1, abs(slope))
 
 
+@long
 def test_a_row_that_is_refused_has_no_numbers_and_no_derivatives():
     lost = np.array(PATHS["left"].translation)
     lost[7] = np.nan
@@ -218,9 +231,25 @@ def test_plans_with_friction(facts, levels):
 
 
 def test_every_tool_needs_a_coefficient():
+    """What one tool is given is not left out for another that has none."""
     tools = TOOLS | {"right": Tool(sphere(5.0))}
-    with pytest.raises(PlanError, match="give each tool its friction"):
+    with pytest.raises(PlanError, match="tool 'right' has none; give each tool its friction"):
         make_scene(TUBE, MATERIAL, PATHS, tool=tools, effects=BARE)
     with pytest.raises(PlanError, match="not every tool has a coefficient"):
         make_scene(TUBE, MATERIAL, PATHS, tool=tools,
                    effects=EffectOptions(want_surface=False, friction="on"))  # fmt: skip
+
+
+@pytest.mark.parametrize("glued", [{"glued": True}, {"tools": 1}])
+def test_what_is_glued_does_not_wander(glued):
+    """With a press of its own in every row it would hold the wall through the air."""
+    contact = "unilateral" if "glued" in glued else "bonded"
+    effects = EffectOptions(want_surface=False, contact=contact, contact_point="per_step")
+    with pytest.raises(PlanError, match="what is glued stays where it touched"):
+        make_plan(SceneFacts(**({"tools": 2, "mesh": False, "poses": True} | glued)), effects)
+
+
+def test_a_plan_says_that_some_are_glued():
+    plan = make_plan(SceneFacts(tools=2, mesh=False, glued=True), BARE)
+    (law,) = [e for e in plan.effects if e.name == "contact law"]
+    assert (law.level, law.reason) == ("mixed", "some tools are glued")
