@@ -51,15 +51,9 @@ class _Step(NamedTuple):
     friction: Coulomb
     before: Stand
 
-    def others(self):
-        """The compliance without the blocks of a contact by itself."""
-        C = self.compliance
-        return C * (1 - jnp.eye(len(C), dtype=C.dtype))[:, None, :, None]
-
     def arrival(self, force, of=slice(None)):
         """Displacement of the tools against the wall that the others move."""
-        moved = jnp.einsum("...ajb,jb->...a", self.others()[of], force, precision=HIGH)
-        return self.displacement[of] - moved
+        return self.displacement[of] - moved_by_others(self.compliance, force, of)
 
     def answer(self, arrived):
         """What each tool does where it arrives: slip and height, and the `Slide`."""
@@ -87,7 +81,7 @@ class _Step(NamedTuple):
         known = jnp.isfinite(jnp.sum(found, axis=1))
         found = jnp.where(known[:, None], found, 0)
         J, m = jnp.where(known[:, None, None], J, 0), len(force)
-        rows = jnp.einsum("iab,ibjc->iajc", J, self.others(), precision=HIGH)
+        rows = jnp.einsum("iab,ibjc->iajc", J, _others(self.compliance), precision=HIGH)
         return found - force, jnp.eye(3 * m, dtype=J.dtype) + rows.reshape(3 * m, 3 * m)
 
     def _alone(self):
@@ -169,7 +163,8 @@ def slide_paths(
         law: -
         friction: -
         lands: whether a tool first touches the wall at rest in the step: its way counts from there,
-            unless others have raised the wall to it before. None: all ways count from the start.
+            unless others have raised the wall to it before. There it stands over what they have
+            dragged, and above what they have pressed. None: all ways count from the start.
 
     Returns:
         A `Slide` with leading axes (steps, m).
@@ -179,13 +174,27 @@ def slide_paths(
     def step(before, row):
         D, lands = row
         if lands is not None:
-            anew = lands & (before.above > 0)
-            slip = jnp.where(anew[:, None], 0, before.slip)
-            before = Stand(slip, jnp.where(anew, 0, before.above), before.force)
+            anew, moved = lands & (before.above > 0), moved_by_others(compliance, before.force)
+            slip = jnp.where(anew[:, None], -moved[:, 1:], before.slip)
+            above = jnp.where(anew, jnp.maximum(moved[:, 0], 0), before.above)
+            before = Stand(slip, above, before.force)
         return slide_together(D, compliance, law, friction, before)
 
     start = Stand(none[:, 1:], none[:, 0], none)
     return jax.lax.scan(step, start, (displacement, lands))[1]
+
+
+def moved_by_others(
+    compliance: Float[Array, "m 3 m 3"], force: Float[Array, "m 3"], of=slice(None)
+) -> Float[Array, "*m 3"]:
+    """Motion of the wall under one tool, or under each, by the forces of all others, mm."""
+    return jnp.einsum("...ajb,jb->...a", _others(compliance)[of], force, precision=HIGH)
+
+
+def _others(compliance):
+    """The compliance without the blocks of a contact by itself."""
+    one = jnp.eye(len(compliance), dtype=compliance.dtype)
+    return compliance * (1 - one)[:, None, :, None]
 
 
 def _has_number(status):

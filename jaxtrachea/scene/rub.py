@@ -64,6 +64,7 @@ class Led(NamedTuple):
         held: the place with the point of the tool that the next step begins with.
         way: of the press since it last slid, see `anchor.press_vector`.
         before: that of the step before, on this place; as the press was then.
+        on: it is on that of the step before.
         changed: the place is not that of the step before, or its press gives way.
         slip: what it has slid before this step.
         touching: -
@@ -73,6 +74,7 @@ class Led(NamedTuple):
     held: Anchor
     way: Float[Array, "3"]
     before: Float[Array, "3"]
+    on: Bool[Array, ""]
     changed: Bool[Array, ""]
     slip: Slip
     touching: Bool[Array, ""]
@@ -89,6 +91,7 @@ class Answer(NamedTuple):
         sunk: what the forces of the step before would, mm.
         slid: along and round the tube, mm.
         dissipated: by friction, N mm.
+        began: where the slip of this step began, mm: not at 0 on a wall that others have dragged.
     """
 
     law: Law
@@ -98,6 +101,7 @@ class Answer(NamedTuple):
     sunk: Float[Array, "3"]
     slid: Float[Array, "2"]
     dissipated: Float[Array, ""]
+    began: Float[Array, "2"]
 
 
 def rub(
@@ -114,7 +118,7 @@ def rub(
     press = path.press
     answer = Answer(
         place.law, press.force[0], press.depth[0], press.skeleton[0], sunk, slid,
-        path.dissipated[0],
+        path.dissipated[0], jnp.zeros_like(slid),
     )  # fmt: skip
     after, total, lost = let_go(scene, led, answer, here)
     along = local_frame(led.anchor.phi)[1:]
@@ -162,6 +166,7 @@ def lead(scene: Scene, state: Any, last: Instant, here: Instant, first: Anchor, 
         held=anchor._replace(body=anchor.body + share * rolled),
         way=way,
         before=press_vector(scene, anchor, last.path) + way - led,
+        on=on,
         changed=on & (follows | (inward != led[0])),
         slip=_within(slip, way[1:], most),
         touching=hit,
@@ -181,8 +186,9 @@ def let_go(
     lost = _energy_lost(led.slip, answer, product(frame.T, led.before))
     stored = _energy(answer, answer.force, answer.depth, answer.skeleton)
     total = led.slip._replace(
-        held=led.slip.held + answer.slid, stored=stored, force=answer.force, depth=answer.depth
-    )
+        held=led.slip.held + answer.slid - answer.began, stored=stored, force=answer.force,
+        depth=answer.depth,
+    )  # fmt: skip
     way = led.way - jnp.concatenate([none, answer.slid])
     after = re_anchor(scene, led.held, way, here.path)
     return after, total, answer.dissipated + jnp.where(led.changed, lost, 0)

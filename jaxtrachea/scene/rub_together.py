@@ -9,7 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxtrachea._numerics import product_of_rows
-from jaxtrachea.mechanics.contacts_friction import Stand, slide_paths, slide_together
+from jaxtrachea.mechanics.contacts_friction import (
+    Stand,
+    moved_by_others,
+    slide_paths,
+    slide_together,
+)
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb, Slide
 from jaxtrachea.mechanics.influence_vector import (
@@ -28,7 +33,7 @@ from jaxtrachea.scene.hold import touched
 from jaxtrachea.scene.instruments import views
 from jaxtrachea.scene.refusals import on_the_tube
 from jaxtrachea.scene.rows import Rows, enter
-from jaxtrachea.scene.rub import Answer, lead, let_go, whole_way
+from jaxtrachea.scene.rub import Answer, Led, lead, let_go, whole_way
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
@@ -85,16 +90,35 @@ def rub_paths(
     return Rubbed(unit, slide_paths(D, felt(scene, unit), law, mu, lands))
 
 
+def _stand(scene: Scene, unit: VectorInfluence, led: Led, before: Float[Array, "m 3"]) -> Stand:
+    """Where each tool stands at the beginning of a step, against the wall as the others hold it.
+
+    One that comes to the wall at rest stands above the wall that others press, and over the place
+    of it that they have dragged there: no way of theirs stretches what it touches.
+
+    Args:
+        scene: -
+        unit: what contacts move.
+        led: the tools.
+        before: forces before the step, in the directions of the contacts.
+    """
+    moved = moved_by_others(felt(scene, unit), jnp.where(jnp.isfinite(before), before, 0))
+    above = jnp.maximum(moved[:, 0] - jnp.where(led.on, led.before[:, 0], 0), 0)
+    clear = led.touching & ~(led.on & (before[:, 0] > 0))
+    anew = (led.touching & ~led.on)[:, None]
+    slip = jnp.where(anew, -moved[:, 1:], 0)
+    return Stand(slip, jnp.where(clear, above, 0), jnp.zeros_like(before))
+
+
 def rub_once(
-    scene: Scene, unit: VectorInfluence, law: Law, way: Float[Array, "m 3"], present
+    scene: Scene, unit: VectorInfluence, law: Law, way: Float[Array, "m 3"], present, stand: Stand
 ) -> Slide:
-    """One step of tools that have not slid yet; those that are not present do nothing."""
-    none, away = jnp.zeros_like(way), jnp.array([-1.0, 0.0, 0.0], way.dtype)
+    """One step of tools on the places that they hold; those that are not present do nothing."""
+    away = jnp.array([-1.0, 0.0, 0.0], way.dtype)
     D = jnp.where(present[:, None], smooth_touch(way, scene.plan.options), away)
     there = present[:, None, None, None] & present[None, None, :, None]
     C = jnp.where(there, felt(scene, unit), 0)
-    start = Stand(none[:, 1:], none[:, 0], none)
-    return slide_together(D, C, law, mu_of(scene), start)[1]
+    return slide_together(D, C, law, mu_of(scene), stand)[1]
 
 
 def rub_step(
@@ -127,14 +151,16 @@ def rub_step(
     unit, law = influence_of(scene, material, *places), law_of(scene, material, places[0])
     way = jnp.where(known, led.way, jnp.nan)
     # A tool in the lumen presses nothing, however deep it is in the wall.
-    slid = rub_once(scene, unit, law, way, present & (led.touching | ~(led.way[:, 0] > 0)))
+    there = present & (led.touching | ~(led.way[:, 0] > 0))
+    stand = _stand(scene, unit, led, jnp.einsum("mx,mkx->mk", rows.state.slip.force, frames))
+    slid = rub_once(scene, unit, law, way, there, stand)
     # In the frame of the tube, where the places have turned since the step before.
     force, depth = (jnp.einsum("mk,mkx->mx", v, frames) for v in (slid.force, slid.depth))
     earlier = jnp.einsum("mx,mkx->mk", led.slip.force, frames)
     skeleton, sunk = (
         by_all(v.reshape(1, -1), own_contacts(unit))[0] for v in (slid.force, earlier)
     )
-    answers = Answer(law, force, depth, skeleton, sunk, slid.slip, slid.dissipated)
+    answers = Answer(law, force, depth, skeleton, sunk, slid.slip, slid.dissipated, stand.slip)
 
     def leave(row):
         row, led, answer = row
