@@ -110,7 +110,7 @@ def on_one_point(
         # What goes on from row to row begins at first touch, where the way is 0. A pose that is no
         # number stays none.
         waits = 0
-        if scene.plan.friction and scene.plan.tools != "one":  # others may lift the wall to it
+        if scene.plan.tools != "one":  # others may lift the wall to it
             waits = -jnp.maximum(seen.gap, 0)[:, None] * inward[None]
         D = jnp.where((jnp.arange(rows) >= first)[:, None] | jnp.isnan(D), D, waits)
 

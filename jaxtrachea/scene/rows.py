@@ -54,6 +54,7 @@ def gather(
     footprints = [view.footprint for view in each]
     rows = jax.tree.map(lambda *v: jnp.stack(v), *zip(paths, off, at, footprints, strict=True))
     path, contact, at, footprints = rows
+    state = dataclasses.replace(state, touching=state.touching & present)
     return Rows(state, path, contact, jax.tree.map(lambda v: v[:, 0], at), footprints)
 
 

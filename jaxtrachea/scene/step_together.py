@@ -106,7 +106,9 @@ def move_tools(
         touching, known = after.touching, rows.at.known
     else:
         after, made, touching, known = _hold(scene, material, state, paths, seen, present, rest)
-    there = present & (touching | ~glued(scene))
+    held = glued(scene)
+    there = present & (touching | ~held) if state.memory is not None else present
+    stuck = held & present & state.touching
     ways = [jax.tree.map(lambda v, k=k: v[k], made)._replace(own=own) for k, own in enumerate(seen)]
     memory, before = after.memory, None
     if memory is not None:
@@ -114,8 +116,13 @@ def move_tools(
         lost = memory.press.lost
         before = Before(memory.press._replace(lost=jnp.max(lost)), dt=dt)
     found, moved, history = press_together(
-        scene, material, paths, ways, there[None], before, pull, rubbed
+        scene, material, paths, ways, there[None], before, pull, rubbed, stuck
     )
+    if held.any() and memory is None:
+        meets = jnp.any(jnp.nan_to_num(found["force"][0]) != 0, axis=1)
+        after = dataclasses.replace(
+            after, touching=jnp.where(held, present & (state.touching | meets), touching)
+        )
     if memory is not None:
         assert history is not None
         kept = history._replace(lost=jnp.broadcast_to(history.lost, lost.shape))
@@ -150,6 +157,8 @@ def _hold(
         new, _, made, held = hold(view, long_run(material), old, here, inside, rest)
         if new.memory is not None:
             made = _where_pressed(made, new.memory, held.touching)
+        elif view.plan.options.contact == "bonded":
+            made = _clear(made, held.touching)
         new = pick(at.known, dataclasses.replace(new, side=side), old)
         return new, made, held.touching, at.known
 
@@ -166,6 +175,12 @@ def _hold(
         return parts[0]
     back = np.argsort(np.concatenate(kinds))
     return jax.tree.map(lambda *v: jnp.concatenate(v)[back], *parts)
+
+
+def _clear(made: Approach, touching: Bool[Array, ""]) -> Approach:
+    """The way of a tool that has not touched yet: how far it is from the wall at rest."""
+    D = jnp.where(touching, made.presses.displacement, -made.own.gap[:, None] * made.inward)
+    return made._replace(presses=dataclasses.replace(made.presses, displacement=D))
 
 
 def _where_pressed(made: Approach, memory: Memory, touching: Bool[Array, ""]) -> Approach:

@@ -93,6 +93,7 @@ def press_together(
     before: Before | None = None,
     pull: Pull | None = None,
     rubbed: Rubbed | None = None,
+    stuck: Bool[Array, " m"] | None = None,
 ) -> tuple[dict[str, Any], Together, History | None]:
     """Fields of a `Simulation` but the surface, what that follows from, and what is remembered.
 
@@ -107,6 +108,7 @@ def press_together(
         before: of a force that relaxes; else None.
         pull: of a single row of tools that wander, see `configurational.forces_by_poses`.
         rubbed: what tools with friction do, if it is known; else they follow their paths.
+        stuck: glued tools that hold the wall before the first row; None: those of presses.
     """
     each = views(scene)
     checked = [without_negative_values(view, long_run(material)) for view in each]
@@ -135,9 +137,11 @@ def press_together(
         # Along their own normals: a tool that waits behind the tube is computed as one in front.
         D = jnp.stack([jnp.sum(p.displacement * n, axis=1) for p, _, n, _ in found], axis=1)
         D = jnp.where(hidden[:, None], 0, D)
-        if present is None and glued(scene).any():
-            present = _touched(made, D) | ~glued(scene)[None]
-        slid, solved = None, _forces(scene, safe, s, phi, D, present, samples)
+        if samples is not None and present is None and glued(scene).any():
+            present = _touched(made, D)
+        if stuck is None:
+            stuck = jnp.array([m is None for m in made]) & glued(scene)
+        slid, solved = None, _forces(scene, safe, s, phi, D, present, samples, stuck)
     vectors, rings, followed = _motion(scene, s, phi, solved, slid)
     moved = Together(s, phi, *followed, made=list(made), paths=paths, hidden=hidden)
     status = solved.status
@@ -256,10 +260,9 @@ def _touched(made: Sequence[Approach | None], D) -> Bool[Array, "rows m"]:
     ], axis=1)  # fmt: skip
 
 
-def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Samples | None):
+def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Samples | None, stuck):
     """All contacts in balance, without friction."""
     options, held = scene.plan.options, glued(scene)
-    mixed = held.any() and not held.all()
     unit = _influence(scene, material, s, phi)
     law = jax.vmap(lambda at: local_law(scene.geometry, material, at, options))(s)
     width, C = None, unit.compliance
@@ -269,14 +272,18 @@ def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Sampl
         found = solve_in_time(D, _felt(scene, C), law, samples, width=width, present=present)
         depth, force, load = found.depth, found.force, found.elastic
         solved = _Solved(unit, depth, force, load, found.status, found.history)
-    elif scene.plan.tools == "coupled" or mixed:
-        bonded, felt = jnp.asarray(held) if mixed else None, _felt(scene, C)
+    elif held.any():
+        found = _glued_rows(scene, D, _felt(scene, C), law, present, stuck)
+        holds = held[None] & (found.force != 0)
+        depth = jnp.where(holds, found.depth, jnp.maximum(found.depth, 0))
+        solved = _Solved(unit, depth, found.force, found.force, found.status)
+    elif scene.plan.tools == "coupled":
 
         def row(D, present):
-            return solve(D, felt, law, width=width, present=present, bonded=bonded)
+            return solve(D, C, law, width=width, present=present)
 
         found = jax.vmap(row, (0, None if present is None else 0))(D, present)
-        depth = jnp.where(held[None], found.depth, jnp.maximum(found.depth, 0))
+        depth = jnp.maximum(found.depth, 0)
         solved = _Solved(unit, depth, found.force, found.force, found.status)
     else:
         there = D if present is None else jnp.where(present, D, 0)
@@ -291,6 +298,20 @@ def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Sampl
         depth = jnp.where(solved.force == 0, rest, D - product_of_rows(solved.load, C))
         solved = solved._replace(depth=depth)
     return solved
+
+
+def _glued_rows(scene: Scene, D, C, law, present, stuck):
+    """Rows of tools of which some are glued where they meet the wall, as the others hold it."""
+    held, width = glued(scene), jnp.asarray(scene.plan.options.onset_width, D.dtype)
+    there = jnp.ones(D.shape, bool) if present is None else present
+
+    def row(stuck, given):
+        D, there = given
+        loose = solve(D, C, law, width=width, present=there, bonded=stuck)
+        stuck = (stuck | (held & (loose.force > 0))) & there
+        return stuck, solve(D, C, law, width=width, present=there, bonded=stuck)
+
+    return jax.lax.scan(row, stuck, (D, there))[1]
 
 
 def _felt(scene: Scene, C: Float[Array, "m m"]) -> Float[Array, "m m"]:

@@ -469,6 +469,16 @@ def test_forceps_hold_beside_a_finger():
         )
         np.testing.assert_allclose(step.force, out.force[i], rtol=0, atol=1e-14)
         np.testing.assert_allclose(step.vertices, out.vertices[i], rtol=0, atol=1e-12)
+    away = session.step({}, present={"forceps": False})
+    assert away.status.tolist() == [NO_CONTACT, OK]
+    over = {"forceps": (np.eye(3), np.array([70, OUTER + 6, 0]))}
+    assert session.step(over).status.tolist() == [NO_CONTACT, OK]  # glued no more
+    # What the finger has pressed down is not where the forceps come to.
+    beside = paths | {"forceps": ball([76, 1, 0], [76, -0.1, 0], 9)}
+    beside["finger"] = ball([80, 0.5, 0], [80, -4, 0], 9)
+    waits = jax.jit(simulate)(scene, SPRINGS, beside)
+    assert waits.status[-1].tolist() == [LIFTED, OK]
+    assert np.abs(waits.force[:, 0]).max() == 0
     with pytest.raises(PlanError, match="a tool that is glued holds the wall along the surface"):
         make_scene(TUBE, MATERIAL, paths, tool=tools, effects=BARE)
 

@@ -151,6 +151,28 @@ def test_a_session_is_the_path_and_functional_steps_are_the_session():
 
 
 @long
+def test_a_tool_that_lands_on_a_dragged_wall_is_not_pulled_along():
+    """Along a path and in a session: what touches now has stretched nothing."""
+    t = np.linspace(0, 1, 6)[:, None]
+    down = [62, OUTER + 5.5, 0] + t * [0, -3.5, 0]
+    drag = down[-1] + t * [2, 0, 0]
+    wait = np.repeat([[95, OUTER + 5.5, 0]], 12, axis=0)
+    paths = {
+        "left": led(np.concatenate([down, drag, np.repeat(drag[-1:], 6, axis=0)])),
+        "right": led(np.concatenate([wait, wait[:1] + t * [0, -2, 0]])),
+    }
+    session = Session(scene(False), MATERIAL)
+    out = jax.device_get(jax.jit(simulate)(scene(False), MATERIAL, paths))
+    dragged = np.abs(out.skeleton[11, 0, 0])
+    assert dragged > 0.5
+    for i in range(18):
+        found = session.step(row_of(paths, i))
+        np.testing.assert_allclose(found.force, out.force[i], rtol=0, atol=1e-9)
+    assert out.status[-1].tolist() == [OK, OK]
+    assert np.abs(out.force[-1, 1, 0]) < 2e-3 * np.abs(out.force[-1, 1, 1])
+
+
+@long
 def test_closed_loops_lose_what_is_told():
     """Two hands that rub round and back: the work is what friction took, to the steps' share."""
     rows = 121
