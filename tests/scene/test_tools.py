@@ -459,7 +459,9 @@ def test_forceps_hold_beside_a_finger():
     found = press_contacts(
         TUBE, SPRINGS, out.s[0], -out.displacement[..., 1], bonded=[True, False], present=True
     )
-    np.testing.assert_allclose(out.force[..., 1], -np.asarray(found.force), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        out.force[2:, :, 1], -np.asarray(found.force)[2:], rtol=0, atol=1e-14
+    )
     assert out.force[-1, 0, 1] > 0.2  # it draws
     assert (out.status[2:] == OK).all()
     session = Session(scene, SPRINGS)
