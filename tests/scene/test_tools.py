@@ -476,8 +476,8 @@ def test_forceps_hold_beside_a_finger():
     over = {"forceps": (np.eye(3), np.array([70, OUTER + 6, 0]))}
     assert session.step(over).status.tolist() == [NO_CONTACT, OK]  # glued no more
     # What the finger has pressed down is not where the forceps come to.
-    beside = paths | {"forceps": ball([76, 1, 0], [76, -0.1, 0], 9)}
-    beside["finger"] = ball([80, 0.5, 0], [80, -4, 0], 9)
+    beside = paths | {"forceps": ball([70, 1, 0], [70, -0.1, 0], 9)}
+    beside["finger"] = ball([80.5, 0.5, 0], [80.5, -4, 0], 9)
     waits = jax.jit(simulate)(scene, SPRINGS, beside)
     assert waits.status[-1].tolist() == [LIFTED, OK]
     assert np.abs(waits.force[:, 0]).max() == 0
