@@ -179,6 +179,37 @@ def solve(
     return ContactForces(depth, force, status, steps)
 
 
+def stick(
+    displacement: Float[Array, "n m"],
+    compliance: Float[Array, "m m"],
+    law: Law,
+    width: Float[Array, ""],
+    glued: Bool[Array, " m"],
+    stuck: Bool[Array, " m"],
+    present: Bool[Array, "n m"] | None = None,
+) -> ContactForces:
+    """Rows of tools of which some are glued from where they meet the wall, as others hold it.
+
+    Args:
+        displacement: see `solve`, as for all others.
+        compliance: -
+        law: -
+        width: -
+        glued: tools that stick where they touch.
+        stuck: those of them that do so before the first row.
+        present: tools that are there; one that is taken away lets go.
+    """
+    present = jnp.ones(displacement.shape, bool) if present is None else present
+
+    def row(stuck, given):
+        D, there = given
+        loose = solve(D, compliance, law, width=width, present=there, bonded=stuck)
+        stuck = (stuck | (glued & (loose.force > 0))) & there
+        return stuck, solve(D, compliance, law, width=width, present=there, bonded=stuck)
+
+    return jax.lax.scan(row, stuck, (displacement, present))[1]
+
+
 def _newton(D, C, contacts: _Contacts, start):
     """Indentations, forces, steps, and how far the last one went, as a share of all motions.
 

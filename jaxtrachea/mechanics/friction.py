@@ -200,6 +200,16 @@ def slide(
     )
 
 
+def without_steps(slid: Slide, lost: Bool[Array, " steps"]) -> Slide:
+    """With zeros in steps without a solution: by 0 times NaN they would reach derivatives."""
+
+    def still(v):
+        off = lost.reshape(-1, *[1] * (v.ndim - 1))
+        return jnp.where(off, jnp.zeros_like(v), v)
+
+    return jax.tree.map(still, slid._replace(status=None))._replace(status=slid.status)
+
+
 def _length(v):
     """Norm with derivative 0 at 0."""
     squared = jnp.sum(v * v)

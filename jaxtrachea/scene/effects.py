@@ -43,7 +43,7 @@ def _contact_point(case: Case) -> Verdict:
     sections = SECTIONS in facts.known
     wished = case.options.friction == "off" and "friction" not in case.finest
     why = "what is glued stays where it touched", "use 'auto'"
-    refused = {"per_step": why} if glued else {}
+    refused = {"per_step": why} if glued and not sections else {}
     if wished and not (glued or sections):
         reason = "friction is off as you wish: every row is a frictionless press of its own"
         return Verdict("per_step", reason)

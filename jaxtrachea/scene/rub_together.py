@@ -179,16 +179,6 @@ def rub_step(
     return after, made, Rubbed(unit, jax.tree.map(lambda v: v[None], slid)), whole
 
 
-def without_rows(slid: Slide, lost: Bool[Array, " rows"]) -> Slide:
-    """With zeros in rows without a solution: by 0 times NaN they would reach derivatives."""
-
-    def still(v):
-        off = lost.reshape(-1, *[1] * (v.ndim - 1))
-        return jnp.where(off, jnp.zeros_like(v), v)
-
-    return jax.tree.map(still, slid._replace(status=None))._replace(status=slid.status)
-
-
 def _in_its_frame(presses: Presses, hidden) -> Float[Array, "rows 3"]:
     """Displacements inwards, along and round the tube where the tool is, behind it or not."""
     D = jnp.where(hidden[:, None], 0, presses.displacement)

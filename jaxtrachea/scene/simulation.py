@@ -188,7 +188,8 @@ def _together(scene: Scene, material: AnyMaterial, paths: Sequence[Poses | Press
     if poses := [path for path in paths if isinstance(path, Poses)]:
         made, pull = approach_together(scene, poses)
     before = before_path(scene, material, paths[0])
-    found, moved, _ = press_together(scene, material, paths, made, before=before, pull=pull)
+    ways = list(zip(paths, made, strict=True))
+    found, moved, _ = press_together(scene, material, ways, before=before, pull=pull)
     vertices = deform_together(scene, moved)
     return as_simulation(found)._replace(vertices=vertices, time=paths[0].time)
 

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import full_precision, product_of_rows, scaled
-from jaxtrachea.mechanics.contacts import solve
+from jaxtrachea.mechanics.contacts import solve, stick
 from jaxtrachea.mechanics.contacts_in_time import solve_in_time
-from jaxtrachea.mechanics.friction import Slide
+from jaxtrachea.mechanics.friction import Slide, without_steps
 from jaxtrachea.mechanics.influence import Influence, influence, level_influence
 from jaxtrachea.mechanics.influence_vector import VectorInfluence
 from jaxtrachea.mechanics.levels.relaxing import RelaxingMaterial, long_run
@@ -31,7 +31,7 @@ from jaxtrachea.scene.instruments import Pull, glued, views
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
-from jaxtrachea.scene.rub_together import Rubbed, influence_of, rub_paths, without_rows
+from jaxtrachea.scene.rub_together import Rubbed, influence_of, rub_paths
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
@@ -87,8 +87,7 @@ class _Solved(NamedTuple):
 def press_together(
     scene: Scene,
     material: Any,
-    paths: Sequence[Poses | Presses],
-    made: Sequence[Approach | None],
+    ways: Sequence[tuple[Poses | Presses, Approach | None]],
     present: Bool[Array, "rows m"] | None = None,
     before: Before | None = None,
     pull: Pull | None = None,
@@ -102,15 +101,14 @@ def press_together(
     Args:
         scene: of several instruments.
         material: -
-        paths: of the tools, all of as many rows.
-        made: the way of each; None: its path is of presses.
+        ways: path of each tool, all of as many rows, and how it comes; None: a path of presses.
         present: tools that are there; None: all, and those that are glued from first touch on.
         before: of a force that relaxes; else None.
         pull: of a single row of tools that wander, see `configurational.forces_by_poses`.
         rubbed: what tools with friction do, if it is known; else they follow their paths.
         stuck: glued tools that hold the wall before the first row; None: those of presses.
     """
-    each = views(scene)
+    each, (paths, made) = views(scene), zip(*ways, strict=True)
     checked = [without_negative_values(view, long_run(material)) for view in each]
     safe, bad = checked[0][0], functools.reduce(jnp.logical_or, (bad for _, bad in checked))
     given = [path if isinstance(path, Presses) else None for path in paths]
@@ -121,8 +119,8 @@ def press_together(
     }
     samples = None
     if before is not None and isinstance(material, RelaxingMaterial):
-        ways = jnp.concatenate([p.displacement for p, *_ in found], axis=1)
-        samples, back = samples_of(material.relaxation, before, ways, refused)
+        together = jnp.concatenate([p.displacement for p, *_ in found], axis=1)
+        samples, back = samples_of(material.relaxation, before, together, refused)
         refused[PressStatus.BACK_IN_TIME] = back
     hidden = functools.reduce(jnp.logical_or, refused.values())
     presses, used = [p for p, *_ in found], [u for _, u, *_ in found]
@@ -131,7 +129,7 @@ def press_together(
         if rubbed is None:
             rubbed = rub_paths(scene, safe, s, phi, presses, hidden, made)
         lost = jnp.isnan(jnp.sum(rubbed.slid.force, axis=(1, 2)))
-        slid, hidden = without_rows(rubbed.slid, lost), hidden | lost
+        slid, hidden = without_steps(rubbed.slid, lost), hidden | lost
         solved = _Solved(rubbed.unit, slid.depth, slid.force, slid.force, slid.status)
     else:
         # Along their own normals: a tool that waits behind the tube is computed as one in front.
@@ -146,7 +144,6 @@ def press_together(
     moved = Together(s, phi, *followed, made=list(made), paths=paths, hidden=hidden)
     status = solved.status
     if pull is not None:
-        ways: Any = list(zip(paths, made, strict=True))
         row = Contacts(s, phi, solved.force, solved.depth)
         vectors |= _by_poses(scene, safe, row, ways, pull)
         lost = ~jnp.isfinite(jnp.sum(vectors["force"] + vectors["moment"], axis=2))
@@ -157,18 +154,19 @@ def press_together(
         for j, v in enumerate(each)
     ]
     word = [status_of(status[:, j], share[j], made[j], refused) for j in range(len(each))]
-    ways = [m for m in made if m is not None]
+    comes = [m for m in made if m is not None]
+    touches = [m.own for m in comes]
 
     def stack(values):
         return jnp.stack(values, axis=1) if values else None
 
     return fields | {
         "s": stack([p.s for p in presses]), "phi": stack([p.phi for p in presses]),
-        "gap": stack([m.own.gap for m in ways]),
+        "gap": stack([touch.gap for touch in touches]),
         "displacement": stack([p.displacement for p in presses]),
-        "frame": stack([m.frame for m in ways if m.frame is not None]),
+        "frame": stack([m.frame for m in comes if m.frame is not None]),
         "depth_share": stack(share),
-        "contact_share": stack([contact_share(v, m.own) for v, m in zip(each, ways, strict=False)]),
+        "contact_share": stack([contact_share(*v) for v in zip(each, touches, strict=False)]),
         "status": _in_space(each, paths, stack(word)),
     }, moved, solved.history  # fmt: skip
 
@@ -273,7 +271,8 @@ def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Sampl
         depth, force, load = found.depth, found.force, found.elastic
         solved = _Solved(unit, depth, force, load, found.status, found.history)
     elif held.any():
-        found = _glued_rows(scene, D, _felt(scene, C), law, present, stuck)
+        width = jnp.asarray(options.onset_width, D.dtype)
+        found = stick(D, _felt(scene, C), law, width, jnp.asarray(held), stuck, present)
         holds = held[None] & (found.force != 0)
         depth = jnp.where(holds, found.depth, jnp.maximum(found.depth, 0))
         solved = _Solved(unit, depth, found.force, found.force, found.status)
@@ -298,20 +297,6 @@ def _forces(scene: Scene, material: Material, s, phi, D, present, samples: Sampl
         depth = jnp.where(solved.force == 0, rest, D - product_of_rows(solved.load, C))
         solved = solved._replace(depth=depth)
     return solved
-
-
-def _glued_rows(scene: Scene, D, C, law, present, stuck):
-    """Rows of tools of which some are glued where they meet the wall, as the others hold it."""
-    held, width = glued(scene), jnp.asarray(scene.plan.options.onset_width, D.dtype)
-    there = jnp.ones(D.shape, bool) if present is None else present
-
-    def row(stuck, given):
-        D, there = given
-        loose = solve(D, C, law, width=width, present=there, bonded=stuck)
-        stuck = (stuck | (held & (loose.force > 0))) & there
-        return stuck, solve(D, C, law, width=width, present=there, bonded=stuck)
-
-    return jax.lax.scan(row, stuck, (D, there))[1]
 
 
 def _felt(scene: Scene, C: Float[Array, "m m"]) -> Float[Array, "m m"]:
