@@ -117,14 +117,7 @@ def move_tools(
         before = Before(memory.press._replace(lost=jnp.max(lost)), dt=dt)
     each = list(zip(paths, ways, strict=True))
     found, moved, history = press_together(
-        scene,
-        material,
-        list(zip(paths, ways, strict=True)),
-        there[None],
-        before,
-        pull,
-        rubbed,
-        stuck,
+        scene, material, each, there[None], before, pull, rubbed, stuck
     )
     if held.any() and memory is None:
         meets = jnp.any(jnp.nan_to_num(found["force"][0]) != 0, axis=1)
