@@ -285,8 +285,7 @@ def _no_lines(case: Case) -> tuple[str, str] | None:
         return (
             "one of them moves along the wall by more than a twentieth of its way: what it drags "
             "along needs friction",
-            "give each tool its friction (0: it slides freely), press straight in, or set "
-            "contact_point 'per_step' (frictionless)",
+            _instead_of_dragging(case),
         )
     if case.facts.glued or case.options.contact == "bonded":
         return (
@@ -299,6 +298,18 @@ def _no_lines(case: Case) -> tuple[str, str] | None:
     if levels["surface"] == "phong":
         return "'phong' interpolates one line of joints", "use 'hermite' or 'linear'"
     return None
+
+
+def _instead_of_dragging(case: Case) -> str:
+    """The cure where tools without friction would drag the wall along."""
+    rub, straight = "give each tool its friction (0: it slides freely)", "press straight in, or set"
+    if case.facts.glued:
+        return f"{straight} contact 'unilateral' and {rub}"
+    if case.levels["relaxation"] != "off":
+        return f"{straight} relaxation 'off' and {rub}"
+    if case.options.coupling != "series":
+        return f"{straight} coupling 'series' and {rub}"
+    return f"{rub}, {straight} contact_point 'per_step' (frictionless)"
 
 
 def _given(name: str) -> Callable[[Case], Verdict]:

@@ -110,17 +110,6 @@ def _stand(scene: Scene, unit: VectorInfluence, led: Led, before: Float[Array, "
     return Stand(slip, jnp.where(clear, above, 0), jnp.zeros_like(before))
 
 
-def rub_once(
-    scene: Scene, unit: VectorInfluence, law: Law, way: Float[Array, "m 3"], present, stand: Stand
-) -> Slide:
-    """One step of tools on the places that they hold; those that are not present do nothing."""
-    away = jnp.array([-1.0, 0.0, 0.0], way.dtype)
-    D = jnp.where(present[:, None], smooth_touch(way, scene.plan.options), away)
-    there = present[:, None, None, None] & present[None, None, :, None]
-    C = jnp.where(there, felt(scene, unit), 0)
-    return slide_together(D, C, law, mu_of(scene), stand)[1]
-
-
 def rub_step(
     scene: Scene, material: Material, rows: Rows, present: Bool[Array, " m"]
 ) -> tuple[Any, Approach, Rubbed, Float[Array, "m 3"]]:
@@ -153,7 +142,11 @@ def rub_step(
     # A tool in the lumen presses nothing, however deep it is in the wall.
     there = present & (led.touching | ~(led.way[:, 0] > 0))
     stand = _stand(scene, unit, led, jnp.einsum("mx,mkx->mk", rows.state.slip.force, frames))
-    slid = rub_once(scene, unit, law, way, there, stand)
+    away = jnp.array([-1.0, 0.0, 0.0], way.dtype)
+    D = jnp.where(there[:, None], smooth_touch(way, scene.plan.options), away)
+    both = there[:, None, None, None] & there[None, None, :, None]
+    C = jnp.where(both, felt(scene, unit), 0)
+    slid = slide_together(D, C, law, mu_of(scene), stand)[1]
     # In the frame of the tube, where the places have turned since the step before.
     force, depth = (jnp.einsum("mk,mkx->mx", v, frames) for v in (slid.force, slid.depth))
     earlier = jnp.einsum("mx,mkx->mk", led.slip.force, frames)

@@ -159,7 +159,7 @@ def _hold(
         if new.memory is not None:
             made = _where_pressed(made, new.memory, held.touching)
         elif view.plan.options.contact == "bonded":
-            made = _clear(made, held.touching)
+            made = _over_the_wall(made, held.touching)
         new = pick(at.known, dataclasses.replace(new, side=side), old)
         return new, made, held.touching, at.known
 
@@ -178,7 +178,7 @@ def _hold(
     return jax.tree.map(lambda *v: jnp.concatenate(v)[back], *parts)
 
 
-def _clear(made: Approach, touching: Bool[Array, ""]) -> Approach:
+def _over_the_wall(made: Approach, touching: Bool[Array, ""]) -> Approach:
     """The way of a tool that has not touched yet: how far it is from the wall at rest."""
     D = jnp.where(touching, made.presses.displacement, -made.own.gap[:, None] * made.inward)
     return made._replace(presses=dataclasses.replace(made.presses, displacement=D))
