@@ -282,7 +282,7 @@ def _draw_view(axis: Any, wall, rest, tool, contacts, share, rings, outline) -> 
         print_ = outline @ camera.T
         axis.add_collection(LineCollection(list(print_[:, :, :2]), colors="k", linewidths=1.1))
     tips = np.stack([camera @ own.tip for own in contacts])[:, 0]
-    sides = [None] if len(tips) == 1 else np.where(tips >= tips.mean(), 1, -1)
+    sides = [1 if tip >= tips.mean() else -1 for tip in tips] if len(tips) > 1 else [None]
     ends = np.concatenate(
         [_draw_force(axis, camera, *one) for one in zip(contacts, sides, strict=True)]
     )
