@@ -71,8 +71,10 @@ def _friction(case: Case) -> Verdict:
         )
     elif options.contact != "unilateral" or options.coupling != "series":
         cannot = "it needs contact 'unilateral' and coupling 'series'"
-    moves = facts.slip > 0
-    reason = "the tool moves along the surface"
+    moves, reason = facts.slip > 0, "the tool moves along the surface"
+    if not moves and facts.friction and facts.angle > 0:
+        # Whatever the coefficient: one that is 0 would be held, too.
+        moves, reason = True, "off the midline the skeleton moves along the surface under the tool"
     if not moves:
         reason = "no motion along the surface"
     elif cannot:

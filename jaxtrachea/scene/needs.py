@@ -73,6 +73,11 @@ def slides(motion: Motion, covered: float = COVERED):
     return _moves(motion.slip, motion.length, covered)
 
 
+def rubs(motion: Motion, covered: float = COVERED):
+    """Whether it moves along the surface, or presses where the skeleton does so under it."""
+    return slides(motion, covered) | off_midline(motion.phi, covered)
+
+
 def drags(motion: Motion, covered: float = COVERED):
     """Whether more than a tenth of its way is along the surface (a plan refuses half of that)."""
     return motion.slip > DRAGS * covered * motion.length + covered

@@ -23,7 +23,7 @@ from jaxtrachea.scene.needs import (
     lateral,
     motion_of,
     off_midline,
-    slides,
+    rubs,
 )
 from jaxtrachea.scene.plan import ValidRange
 from jaxtrachea.scene.stage import Presses, Scene
@@ -83,7 +83,7 @@ def outside_plan(
         found += [elsewhere(motion)] if given else _wandering(scene, motion)
         if _frictionless(scene):
             # What slid leaves its trace in later rows.
-            found.append(jnp.cumsum(pressing & slides(motion)) > 0)
+            found.append(jnp.cumsum(pressing & rubs(motion)) > 0)
     if plan.valid_range is not None:
         found.append(_beyond(plan.valid_range, presses))
     if "skeleton" in less:

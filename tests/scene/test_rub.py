@@ -235,6 +235,23 @@ def test_a_bad_pose_costs_itself_only(session):
         np.testing.assert_array_equal(session.step(EYE, place).force, known.force[i])
 
 
+@pytest.mark.parametrize("mu", [0.0, 0.05])
+def test_what_presses_straight_in_off_the_midline_keeps_to_the_cone(mu):
+    """The skeleton moves along the surface under it; held there it would carry a tenth of the force."""
+    down = placed(np.array([[75, 0.6, 0.0], [75, 0.6, 1], [75, 0.6, 2]]), OUTER)
+    path = Poses(np.broadcast_to(EYE, (3, 3, 3)), down)
+    scene = make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, mu),
+                       effects=EffectOptions(want_surface=False))  # fmt: skip
+    out = jax.jit(simulate)(scene, MATERIAL, path)
+    normal, tangential = split(out)
+    np.testing.assert_allclose(tangential[1:], mu * normal[1:], rtol=1e-9, atol=1e-12)
+    assert (normal[1:] > 0.01).all()
+    held = dataclasses.replace(scene.plan, friction=False, ignored=frozenset({"friction"}))
+    out = jax.jit(simulate)(dataclasses.replace(scene, plan=held), MATERIAL, path)
+    normal, tangential = split(out)
+    assert (tangential[1:] > 0.1 * normal[1:]).all()
+
+
 @pytest.mark.slow
 def test_off_is_frictionless():
     """A ball led 30 mm along and back: it was held, and lost 8.33 N mm."""

@@ -242,7 +242,8 @@ def test_a_row_that_is_refused_has_no_numbers_and_no_derivatives():
     [
         ({"slip": 1.0, "along": 0.5, "friction": True, "drags": True,
           "known": frozenset({"EA_L"})}, ("on", "on", "coupled")),
-        ({"angle": 1.0, "slip": 0.0, "friction": True}, ("off", "off", "coupled")),
+        ({"angle": 1.0, "slip": 0.0, "friction": True}, ("on", "off", "coupled")),
+        ({"angle": 0.0, "slip": 0.0, "friction": True}, ("off", "off", "coupled")),
     ],
 )  # fmt: skip
 def test_plans_with_friction(facts, levels):
