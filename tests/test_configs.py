@@ -42,6 +42,7 @@ SHOWS = {
     "relaxation": {"relaxation": "uniform", "contact": "on", "contact_point": "fixed"},
     "retractor": {"tools": "coupled", "contact": "on"},
     "right_down": {"axial": "on", "rings": "arch2"},
+    "suture": {"tools": "coupled", "contact law": "mixed"},
     "two_fingers": {"tools": "coupled", "contact": "on"},
     "scan": {"contact_point": "per_step", "surface": "off"},
 }
@@ -351,6 +352,12 @@ BAD = {
         ["wall.h_C is 4.0 mm", "at most the thickness"],
     ),
     "two skeletons": (GOOD + "[wall]\n" + PRESS, ["wall", "not together with [material]"]),
+    "friction of a glued tool": (
+        GOOD
+        + '[tool]\nshape = "sphere"\nradius = "5 mm"\nfriction = 0.3\ncontact = "bonded"\n'
+        + PRESS,
+        ["tool", "friction: not together with contact = 'bonded'", "remove one"],
+    ),
     "plane too few": (
         GOOD + PRESS + "phi = '20 deg'\n[effects]\nsecond_plane = 'off'",
         ["effects.second_plane", "20 deg off the midline", "auto"],

@@ -228,8 +228,8 @@ def test_no_forces_gain_energy_and_none_jump_between_meridians():
     run = jax.jit(jax.vmap(lambda s, phi: influence_vector(
         TUBE, SPRUNG, s, phi, rings="arch2", shear=False, tangential=True, axial=True
     ).compliance))  # fmt: skip
-    s, phi = rng.uniform(0, float(TUBE.length), (500, 4)), rng.uniform(-1.9, 1.9, (500, 4))
-    s[::3, 1], phi[::2, 1] = s[::3, 0], phi[::2, 0] + rng.choice([0, 1e-4, 0.1], 250)
+    s, phi = rng.uniform(0, float(TUBE.length), (10_000, 4)), rng.uniform(-1.9, 1.9, (10_000, 4))
+    s[::3, 1], phi[::2, 1] = s[::3, 0], phi[::2, 0] + rng.choice([0, 1e-4, 0.1], 5_000)
     C = np.asarray(run(s, phi))
     least = np.linalg.eigvalsh(C)
     assert (least[:, 0] > -1e-12 * least[:, -1]).all()

@@ -145,7 +145,8 @@ def slide_together(
         jnp.where(solved, v, jnp.nan) for v in (found.depth, found.force, found.dissipated)
     )
     status = jnp.where(solved, status, failed).astype(jnp.int8)
-    return after, Slide(depth, force, after.slip, lost, found.sliding & solved, status)
+    sliding = found.sliding & solved
+    return after, Slide(depth, force, after.slip, lost, sliding, status, found.began)
 
 
 def slide_paths(
@@ -167,20 +168,23 @@ def slide_paths(
             dragged, and above what they have pressed. None: all ways count from the start.
 
     Returns:
-        A `Slide` with leading axes (steps, m).
+        A `Slide` with leading axes (steps, m); `began` is that of the first contact.
     """
     none = jnp.zeros_like(displacement[0])
 
-    def step(before, row):
-        D, lands = row
+    def step(state, row):
+        (before, met, began), (D, lands) = state, row
         if lands is not None:
             anew, moved = lands & (before.above > 0), moved_by_others(compliance, before.force)
             slip = jnp.where(anew[:, None], -moved[:, 1:], before.slip)
             above = jnp.where(anew, jnp.maximum(moved[:, 0], 0), before.above)
             before = Stand(slip, above, before.force)
-        return slide_together(D, compliance, law, friction, before)
+        after, slid = slide_together(D, compliance, law, friction, before)
+        began = jnp.where(met[:, None], began, slid.began)
+        met = met | (slid.status == PressStatus.OK)
+        return (after, met, began), slid._replace(began=began)
 
-    start = Stand(none[:, 1:], none[:, 0], none)
+    start = Stand(none[:, 1:], none[:, 0], none), jnp.zeros(len(none), bool), none[:, 1:]
     return jax.lax.scan(step, start, (displacement, lands))[1]
 
 

@@ -69,6 +69,7 @@ class Slide(NamedTuple):
         dissipated: work lost to friction in this step, N mm; not negative.
         sliding: whether this step slides.
         status: a `PressStatus` as int8.
+        began: the slip where the step came into contact, out of contact that at its end, mm; (2,).
     """
 
     depth: Float[Array, "*n 3"]
@@ -77,6 +78,7 @@ class Slide(NamedTuple):
     dissipated: Float[Array, "*n"]
     sliding: Bool[Array, "*n"]
     status: Int[Array, "*n"]
+    began: Float[Array, "*n 2"]
 
 
 def slide_path(
@@ -197,6 +199,7 @@ def slide(
         dissipated=jnp.sum(jnp.where(solved, force[1:], 0) * moved),
         sliding=sliding,
         status=jnp.where(touching, status, PressStatus.NO_CONTACT).astype(jnp.int8),
+        began=jnp.where(touching, slip, away),
     )
 
 

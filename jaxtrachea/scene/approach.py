@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import full_precision
+from jaxtrachea._numerics import full_precision, product_of_rows
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
@@ -112,6 +112,8 @@ def on_one_point(
         waits = 0
         if scene.plan.tools != "one":  # others may lift the wall to it
             waits = -jnp.maximum(seen.gap, 0)[:, None] * inward[None]
+            if scene.plan.friction:
+                waits = waits + D - product_of_rows(D, inward)[:, None] * inward[None]
         D = jnp.where((jnp.arange(rows) >= first)[:, None] | jnp.isnan(D), D, waits)
 
     def spread(v):

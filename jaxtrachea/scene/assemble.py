@@ -191,10 +191,12 @@ def _check_friction(tools: Mapping[str, Tool], effects: EffectOptions) -> None:
     """
     without = [name for name, tool in tools.items() if tool.friction is None]
     if 0 < len(without) < len(tools) and effects.friction == "auto":
-        raise PlanError(
-            "friction", "a tool has a coefficient", f"tool {without[0]!r} has none",
-            "give each tool its friction (0: it slides freely), or set friction 'off'",
-        )  # fmt: skip
+        why = f"tool {without[0]!r} has none"
+        cure = "give each tool its friction (0: it slides freely), or set friction 'off'"
+        if glued := [n for n in without if (tools[n].contact or effects.contact) == "bonded"]:
+            why = f"beside tool {glued[0]!r}, which is glued, none is derived"
+            cure = "leave tool.friction out (tools slide freely), or set friction 'off'"
+        raise PlanError("friction", "a tool has a coefficient", why, cure)
 
 
 def _check_apart(paths: Mapping[str, Poses | Presses]) -> None:

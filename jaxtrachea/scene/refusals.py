@@ -53,16 +53,8 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
     acting = pressing
     if scene.plan.options.contact == "bonded":
         acting = ~jnp.all(D == 0, axis=1)
-    low, high = _places(scene)
-    outside = ~((presses.s >= low) & (presses.s <= high))
-    if made is not None:
-        outside = pressing & (outside | off_the_end(scene, made.own))
-    refused = {PressStatus.OFF_TUBE: outside}
-    unlike = outside_plan(scene, material, presses, acting)
-    if unlike is not None:
-        refused[PressStatus.OFF_PLAN] = unlike
+    refused = beyond(scene, material, presses, made, pressing, acting)
     s, mid, behind = on_the_tube(scene, presses.s, phi)
-    refused[PressStatus.BEHIND_GAP] = behind & acting
     if made is not None:
         refused[PressStatus.IN_LUMEN] = made.inside
     number = jnp.sum(D, axis=1) + presses.s + phi
@@ -80,6 +72,32 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
         s, mid = (jnp.where(jnp.isnan(v), 0, v) for v in (s, mid))
     used = Presses(s, mid, jnp.where(idle[:, None], jnp.zeros_like(D), D))
     return Presses(presses.s, phi, D), used, inward, refused
+
+
+def beyond(
+    scene: Scene, material: AnyMaterial, presses: Presses, made: Approach | None,
+    pressing: Bool[Array, " rows"], acting: Bool[Array, " rows"],
+) -> dict[PressStatus, Bool[Array, " rows"]]:  # fmt: skip
+    """Rows that press where there is no tube or no ring, or need what the plan has not, by status.
+
+    Args:
+        scene: -
+        material: -
+        presses: of every row.
+        made: how a tool comes to them; None: they are given, and off the tube pressing or not.
+        pressing: which rows press.
+        acting: which press or draw.
+    """
+    low, high = _places(scene)
+    outside = ~((presses.s >= low) & (presses.s <= high))
+    if made is not None:
+        outside = pressing & (outside | off_the_end(scene, made.own))
+    refused = {PressStatus.OFF_TUBE: outside}
+    unlike = outside_plan(scene, material, presses, acting)
+    if unlike is not None:
+        refused[PressStatus.OFF_PLAN] = unlike
+    refused[PressStatus.BEHIND_GAP] = on_the_tube(scene, presses.s, presses.phi)[2] & acting
+    return refused
 
 
 def at_rest(scene: Scene) -> bool:

@@ -144,6 +144,7 @@ def rub(
 def lead(scene: Scene, state: Any, last: Instant, here: Instant, first: Anchor, hit) -> Led:
     """The place that the tool holds now, and its press; arguments as for `grip`."""
     depth, most = -here.seen.gap[0], SPACING_SHARE * half_spacing(scene)
+    deep = jnp.maximum(depth, 0)  # not so where others raise the wall to a tool above it
     teleported = step_length(first, last, here) > scene.radius
     teleported = teleported | (state.touching & has_left(scene, state.anchor, last, here))
     on = state.touching & hit & ~teleported
@@ -154,10 +155,10 @@ def lead(scene: Scene, state: Any, last: Instant, here: Instant, first: Anchor, 
     now = anchor_at(scene, here)
     anchor = pick(teleported, now, pick(on, followed, first))
     led = press_vector(scene, anchor, here.path)
-    mismatch = MAX_MISMATCH * jnp.where(hit, depth, jnp.inf)
+    mismatch = MAX_MISMATCH * jnp.where(hit, deep, jnp.inf)
     inward = jnp.clip(led[0], depth - mismatch, depth + mismatch)
     rolled = now.body - anchor.body
-    share = 1 - limit(jnp.where(hit, depth, 0), length(rolled))
+    share = 1 - limit(jnp.where(hit, deep, 0), length(rolled))
     inward = inward + share * (depth - inward)
     way = jnp.concatenate([inward[None], led[1:]])
     slip = pick(on, _behind(scene, state, followed), no_slip(way.dtype))

@@ -43,7 +43,8 @@ class Rubbed(NamedTuple):
 
     Attributes:
         unit: what unit forces in all directions of all contacts move.
-        slid: of each tool in each row, in (inward, along, round the tube) of its contact.
+        slid: of each tool in each row, in (inward, along, round the tube) of its contact; slip less
+            `began` is that since it touched first.
     """
 
     unit: VectorInfluence
@@ -103,10 +104,10 @@ def _stand(scene: Scene, unit: VectorInfluence, led: Led, before: Float[Array, "
         before: forces before the step, in the directions of the contacts.
     """
     moved = moved_by_others(felt(scene, unit), jnp.where(jnp.isfinite(before), before, 0))
-    above = jnp.maximum(moved[:, 0] - jnp.where(led.on, led.before[:, 0], 0), 0)
-    clear = led.touching & ~(led.on & (before[:, 0] > 0))
-    anew = (led.touching & ~led.on)[:, None]
-    slip = jnp.where(anew, -moved[:, 1:], 0)
+    lands = led.touching & ~led.on  # its way counts from the wall at rest
+    above = jnp.maximum(moved[:, 0] - jnp.where(lands, 0, led.before[:, 0]), 0)
+    clear = ~(led.on & (before[:, 0] > 0))
+    slip = jnp.where(led.on[:, None], 0, -moved[:, 1:])
     return Stand(slip, jnp.where(clear, above, 0), jnp.zeros_like(before))
 
 
@@ -132,6 +133,7 @@ def rub_step(
     def take(row):
         view, here, _, inside = enter(first, row)
         last, place, hit = touched(view, row.state, here, inside)
+        hit = hit | (row.state.touching & ~inside[0])
         return lead(view, row.state, last, here, place, hit)
 
     led = jax.lax.map(take, rows)
@@ -153,21 +155,25 @@ def rub_step(
     skeleton, sunk = (
         by_all(v.reshape(1, -1), own_contacts(unit))[0] for v in (slid.force, earlier)
     )
-    answers = Answer(law, force, depth, skeleton, sunk, slid.slip, slid.dissipated, stand.slip)
+    began = jnp.where(led.on[:, None], 0, slid.began)
+    answers = Answer(law, force, depth, skeleton, sunk, slid.slip, slid.dissipated, began)
 
     def leave(row):
         row, led, answer = row
         view, here, side, inside = enter(first, row)
         after, total, lost = let_go(view, led, answer, here)
         _, made = as_approach(view, led.anchor, whole_way(led), here, inside)
+        # On its place, too, where it does not touch the wall at rest, but one that others raise.
+        bears = jnp.sum(local_frame(led.anchor.phi)[0] * answer.force) > 0
+        on = bears | (row.seen.gap[0] < 0) & ~inside[0]
         new = dataclasses.replace(
-            row.state, started=jnp.asarray(True), touching=led.touching, last=here, anchor=after,
-            slip=total, side=side,
+            row.state, started=jnp.asarray(True), touching=on, last=here, anchor=after, slip=total,
+            side=side,
         )  # fmt: skip
         return pick(known, new, row.state), made, total, lost
 
     after, made, total, lost = jax.lax.map(leave, (rows, led, answers))
-    slid = slid._replace(slip=total.held, dissipated=lost)
+    slid = slid._replace(slip=total.held, dissipated=lost, began=jnp.zeros_like(total.held))
     whole = jnp.einsum("mk,mkx->mx", total.held + total.before, frames[:, 1:])
     return after, made, Rubbed(unit, jax.tree.map(lambda v: v[None], slid)), whole
 

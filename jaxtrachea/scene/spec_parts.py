@@ -253,6 +253,11 @@ class ToolSection(ShapeSection):
     def _one_kind(self) -> "ToolSection":
         if self.shape is not None and self.parts is not None:
             raise ValueError("parts: not together with shape; remove one")
+        if self.friction is not None and self.contact == "bonded":
+            raise ValueError(
+                "friction: not together with contact = 'bonded', as what is glued does not slide; "
+                "remove one"
+            )
         return self
 
 

@@ -82,13 +82,18 @@ class Tool:
         """Refuse a friction that there is not, what is no shape, and a contact that is none.
 
         Raises:
-            ValueError: negative or not finite; another word.
+            ValueError: negative or not finite, or of a glued tool; another word.
         """
         check_word("tool.contact", self.contact, Literal["unilateral", "bonded"] | None)
         friction = self.friction
         check_word("tool.shape", self.shape, Shape | None)
         if friction is not None and not 0 <= float(friction) < math.inf:
             raise ValueError(f"friction is {friction}; expected a finite number, not negative")
+        if friction is not None and self.contact == "bonded":
+            raise ValueError(
+                f"friction is {friction}, and contact is 'bonded'; expected one of them: what is "
+                "glued does not slide"
+            )
 
 
 def check_material(geometry: Geometry, material: AnyMaterial) -> None:

@@ -30,7 +30,13 @@ from jaxtrachea.scene.in_time import Before, samples_of
 from jaxtrachea.scene.instruments import Pull, glued, views
 from jaxtrachea.scene.overlap import overlapping
 from jaxtrachea.scene.ranges import contact_share, depth_share
-from jaxtrachea.scene.refusals import mask_rows, refuse, status_of, without_negative_values
+from jaxtrachea.scene.refusals import (
+    beyond,
+    mask_rows,
+    refuse,
+    status_of,
+    without_negative_values,
+)
 from jaxtrachea.scene.rub_together import Rubbed, influence_of, rub_paths
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
@@ -140,6 +146,8 @@ def press_together(
         if stuck is None:
             stuck = jnp.array([m is None for m in made]) & glued(scene)
         slid, solved = None, _forces(scene, safe, s, phi, D, present, samples, stuck)
+    for code, rows in _reached_beyond(each, safe, found, made, solved).items():
+        refused[code], hidden = refused.get(code, False) | rows, hidden | rows
     vectors, rings, followed = _motion(scene, s, phi, solved, slid)
     moved = Together(s, phi, *followed, made=list(made), paths=paths, hidden=hidden)
     status = solved.status
@@ -171,6 +179,22 @@ def press_together(
     }, moved, solved.history  # fmt: skip
 
 
+def _reached_beyond(
+    each: list[Scene], material: Material, found: list, made: Sequence[Approach | None],
+    solved: _Solved,
+) -> dict[PressStatus, Bool[Array, " rows"]]:  # fmt: skip
+    """Rows in which others raise the wall to a tool where it may not press: see `beyond`."""
+    force = solved.force if solved.force.ndim == 2 else solved.force[..., 0]
+    refused: dict[PressStatus, Any] = {}
+    for j, (view, (presses, _, inward, _), way) in enumerate(zip(each, found, made, strict=True)):
+        if way is None:
+            continue
+        reached = (force[:, j] != 0) & (jnp.sum(presses.displacement * inward, axis=1) <= 0)
+        for code, rows in beyond(view, material, presses, way, reached, reached).items():
+            refused[code] = refused.get(code, False) | rows
+    return refused
+
+
 def _in_space(each: list[Scene], paths: Sequence[Poses | Presses], status):
     """The statuses, with a word for solved rows of tools that overlap one another."""
     poses = [path for path in paths if isinstance(path, Poses)]
@@ -195,7 +219,7 @@ def _motion(
     Returns:
         Two mappings of fields of a `Simulation`, and those of `Together` from `depth` to `lines`.
     """
-    unit, depth, inward, slip = solved.unit, solved.depth, None, None
+    unit, depth, inward, slip, slipped = solved.unit, solved.depth, None, None, None
     if isinstance(unit, Influence):
         does, bears = (lines.on_midline(unit, v, _half(scene)) for v in (solved.load, solved.force))
         force, vector = (lines.anterior(-v) for v in (solved.force, depth))
@@ -208,9 +232,9 @@ def _motion(
         if slid is None:
             force, vector = (scaled(v[..., None], inward[None]) for v in (solved.force, depth))
         else:
-            force, vector, slip = (
+            force, vector, slip, slipped = (
                 jnp.einsum("rmk,mkx->rmx", v, frames[:, -v.shape[2] :])
-                for v in (solved.force, depth, slid.slip)
+                for v in (solved.force, depth, slid.slip, slid.slip - slid.began)
             )
             square = jnp.sum(depth * depth, axis=-1)
             depth = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
@@ -218,7 +242,7 @@ def _motion(
             inward = jnp.where(deep > 0, vector / jnp.where(deep > 0, deep, 1), inward[None])
     vectors = {"force": force, "depth": vector, "skeleton": does.skeleton}
     if slid is not None:
-        vectors |= {"slip": slip, "dissipated": slid.dissipated}
+        vectors |= {"slip": slipped, "dissipated": slid.dissipated}
     rings = {"joints": does.joints, "loads": bears.loads} if scene.plan.joints else {}
     if scene.plan.ring_ends:
         rings |= {"end_U": does.lines.U, "end_V": does.lines.V}

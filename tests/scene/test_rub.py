@@ -237,7 +237,7 @@ def test_a_bad_pose_costs_itself_only(session):
 
 @pytest.mark.parametrize("mu", [0.0, 0.05])
 def test_what_presses_straight_in_off_the_midline_keeps_to_the_cone(mu):
-    """The skeleton moves along the surface under it; held there it would carry a tenth of the force."""
+    """The skeleton moves along the surface under it: held there it would carry more."""
     down = placed(np.array([[75, 0.6, 0.0], [75, 0.6, 1], [75, 0.6, 2]]), OUTER)
     path = Poses(np.broadcast_to(EYE, (3, 3, 3)), down)
     scene = make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, mu),

@@ -173,6 +173,32 @@ def test_a_tool_that_lands_on_a_dragged_wall_is_not_pulled_along():
 
 
 @long
+def test_a_tool_that_is_only_reached_by_a_raised_wall_sticks_to_it():
+    """Clear of the wall at rest, beyond a stiff ligament's lobe; led along, to and fro."""
+    stiff = dataclasses.replace(MATERIAL, EI_L=30 * MATERIAL.EI_L)
+    t, reach = np.linspace(0, 1, 12), OUTER + 5.03
+    down, go = np.clip(2 * t, 0, 1), np.clip(2 * t - 1, 0, 1)
+    aside = 0.05 * np.sin(1.5 * np.pi * go)
+    round_, phi, high = 0 * t, 0.1 + 0.001 * go, reach + 0.002 * go
+    paths = {
+        "left": led(np.stack([75 + round_, OUTER + 5.5 - 4.5 * down, round_], axis=1)),
+        "right": led(np.stack([35 + aside, high * np.cos(phi), high * np.sin(phi)], axis=1)),
+    }
+    out = jax.device_get(program(False)(stiff, paths))
+    assert out.gap[:, 1].min() > 0.005
+    assert np.abs(out.force[-1, 1, 0]) > 0.1 * np.abs(out.force[-1, 1, 1])
+    assert np.ptp(out.force[6:, 1, 0]) > 1e-3
+    session = Session(scene(False), stiff)
+    for i in range(12):
+        found = session.step(row_of(paths, i))
+        assert found.status.tolist() == out.status[i].tolist()
+        np.testing.assert_allclose(found.force, out.force[i], rtol=0, atol=2e-6)
+        np.testing.assert_allclose(found.slip, out.slip[i], rtol=0, atol=2e-4)
+    gone = session.step({"left": (np.eye(3), np.array([75, OUTER + 9.0, 0]))})
+    assert gone.status.tolist() == [NO_CONTACT, NO_CONTACT]
+
+
+@long
 def test_closed_loops_lose_what_is_told():
     """Two hands that rub round and back: the work is what friction took, to the steps' share."""
     rows = 121
@@ -243,7 +269,8 @@ def test_a_row_that_is_refused_has_no_numbers_and_no_derivatives():
         ({"slip": 1.0, "along": 0.5, "friction": True, "drags": True,
           "known": frozenset({"EA_L"})}, ("on", "on", "coupled")),
         ({"angle": 1.0, "slip": 0.0, "friction": True}, ("on", "off", "coupled")),
-        ({"angle": 0.0, "slip": 0.0, "friction": True}, ("off", "off", "coupled")),
+        ({"friction": True}, ("on", "off", "coupled")),
+        ({}, ("off", "off", "coupled")),
     ],
 )  # fmt: skip
 def test_plans_with_friction(facts, levels):
@@ -261,6 +288,15 @@ def test_every_tool_needs_a_coefficient():
     with pytest.raises(PlanError, match="not every tool has a coefficient"):
         make_scene(TUBE, MATERIAL, PATHS, tool=tools,
                    effects=EffectOptions(want_surface=False, friction="on"))  # fmt: skip
+
+
+def test_what_is_glued_has_no_friction():
+    """Neither its own, nor beside tools that have some."""
+    with pytest.raises(ValueError, match="friction is 0.3, and contact is 'bonded'"):
+        Tool(BALL, 0.3, "bonded")
+    tools = TOOLS | {"right": Tool(BALL, contact="bonded")}
+    with pytest.raises(PlanError, match="beside tool 'right', which is glued, none is derived"):
+        make_scene(TUBE, MATERIAL, PATHS, tool=tools, effects=BARE)
 
 
 @pytest.mark.parametrize("glued", [{"glued": True}, {"tools": 1}])
