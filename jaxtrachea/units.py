@@ -285,9 +285,6 @@ def column_unit(header: str) -> tuple[str, str | None]:
     ``("force", "N")``. What stands in brackets is taken for a unit whether or not it is a known
     one, so that a slip is reported as such; after ``_``, ``/`` or a comma only a known unit counts.
 
-    Args:
-        header: the header cell.
-
     Returns:
         Name and unit; the unit is None if the header has none.
     """

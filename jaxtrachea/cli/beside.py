@@ -9,11 +9,7 @@ from typing import Any
 
 
 def load_beside(module: str) -> None:
-    """Import a module in a thread; what is wrong with it is said where it is used.
-
-    Args:
-        module: full name.
-    """
+    """Import a module in a thread; what is wrong with it is said where it is used."""
 
     def load() -> None:
         with contextlib.suppress(Exception):

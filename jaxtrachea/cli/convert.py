@@ -60,11 +60,7 @@ def _check_target(target: Path) -> None:
 
 
 def _read(sources: list[Path], path: Path | None):
-    """The curves of the files.
-
-    Raises:
-        Stop: a file, the specification or its options cannot be used.
-    """
+    """The curves of the files."""
     from jaxtrachea.config import DataSection, FitSpec, SpecError, load_fit_spec
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError
@@ -87,11 +83,7 @@ def _read(sources: list[Path], path: Path | None):
 
 
 def _write(target: Path, measurements) -> None:
-    """Write the usable curves.
-
-    Raises:
-        Stop: the format cannot hold them, or the file cannot be written.
-    """
+    """Write the usable curves."""
     from jaxtrachea._errors import InputError
     from jaxtrachea.measurements.read import write_hdf5
     from jaxtrachea.measurements.tidy_writer import write_tidy

@@ -185,11 +185,7 @@ def _check_target(options: InitOptions) -> None:
 
 
 def _write(options: InitOptions, text: str) -> None:
-    """Write the specification, whole or not at all.
-
-    Raises:
-        Stop: it cannot be written.
-    """
+    """Write the specification, whole or not at all."""
     from jaxtrachea.config import FitSpec
     from jaxtrachea.files.atomic import write_whole
 

@@ -154,11 +154,7 @@ def as_options(text: str) -> str:
 
 
 def _expanded(paths: Sequence[Path]) -> list[Path]:
-    """Files of the arguments, each once; a folder stands for the data files in it.
-
-    Raises:
-        Stop: there is no such file, or it is a specification, or a folder without data files.
-    """
+    """Files of the arguments, each once; a folder stands for the data files in it."""
     files: dict[Path, None] = {}
     for path in paths:
         if path.is_dir():
@@ -186,11 +182,7 @@ def _is_data(path: Path) -> bool:
 
 
 def _options(keys: dict[str, Any]):
-    """How to read, of what was said.
-
-    Raises:
-        Stop: it cannot be.
-    """
+    """How to read, of what was said."""
     from jaxtrachea._errors import InputError
     from jaxtrachea.measurements.curve import ReadOptions
     from jaxtrachea.measurements.readers import reader_of
@@ -208,11 +200,7 @@ def _options(keys: dict[str, Any]):
 
 
 def _heads(files: Sequence[Path], keys: dict[str, Any]) -> dict[Path, Any]:
-    """Heads of the files that can be opened; what is wrong with others is said when they are read.
-
-    Raises:
-        Stop: the only file cannot be opened.
-    """
+    """Heads of the files that can be opened; reading says what is wrong with the others."""
     from jaxtrachea.measurements.heads import head_of
     from jaxtrachea.measurements.read import DataError
 
@@ -227,11 +215,7 @@ def _heads(files: Sequence[Path], keys: dict[str, Any]) -> dict[Path, Any]:
 
 
 def _read(files: Sequence[Path], keys: dict[str, Any]):
-    """The measurements.
-
-    Raises:
-        Stop: the files cannot be read so.
-    """
+    """The measurements."""
     from jaxtrachea.config import DataSection, FitSpec, SpecError
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError

@@ -53,11 +53,7 @@ def view(
 
 
 def _content(file: Path) -> dict:
-    """Tables of a scene or a fit.
-
-    Raises:
-        Stop: no such file, no TOML, or a scene that no hand can move.
-    """
+    """Tables of a scene or a fit."""
     from jaxtrachea.files.toml import SpecError, read_tables
 
     if not file.is_file():
@@ -78,11 +74,7 @@ def _content(file: Path) -> dict:
 
 
 def _experiment(path: Path, begin: Callable[[str], None]):
-    """The curves of a fit specification, and the `Online` that will take their samples.
-
-    Raises:
-        ValueError: what cannot be read, or cannot be fitted sample by sample.
-    """
+    """The curves of a fit specification, and the `Online` that will take their samples."""
     from jaxtrachea.cli.load import load
     from jaxtrachea.inference.online import Online
     from jaxtrachea.viewer.stream import Experiment

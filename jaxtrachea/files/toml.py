@@ -57,10 +57,6 @@ def load_spec(
 def read_tables(path: Path, called: str) -> dict[str, Any]:
     """Read a TOML file.
 
-    Args:
-        path: of the file.
-        called: what a user calls it.
-
     Raises:
         SpecError: it cannot be read, or is no TOML.
     """
@@ -82,11 +78,7 @@ def read_tables(path: Path, called: str) -> dict[str, Any]:
 
 
 def _text(path: Path, called: str) -> str:
-    """Content of a specification.
-
-    Raises:
-        SpecError: no such file, none at all, too long, or not UTF-8.
-    """
+    """Content of a specification."""
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise SpecError("is a device or a pipe", place=str(path), expected=f"a TOML {called}")

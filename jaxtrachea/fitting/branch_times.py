@@ -32,11 +32,6 @@ def unsampled_time(result: Any, lane: int, i: int) -> str:
     Its time, with the 95 % interval, has to lie between the least step of the samples and the
     longest record. The density `C` of `fung` is an estimate where times from tau_1 to tau_2 surely
     lie there, and the numbers of `power` where the records span a decade of time.
-
-    Args:
-        result: the `FitResult`.
-        lane: of it.
-        i: unknown of the lane.
     """
     model, (unknown, specimen, trial) = result.study.model, result.study.unknowns[lane][i]
     if not model.relaxes:

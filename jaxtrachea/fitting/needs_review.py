@@ -57,14 +57,7 @@ def local_doubt(
     present: Bool[np.ndarray, "lanes P"],
     at_bound: Bool[np.ndarray, "lanes P"],
 ) -> Bool[np.ndarray, "lanes P"]:
-    """Unknowns that give cause by their errors at the estimate alone.
-
-    Args:
-        uncertainty: at the estimate.
-        natural: from `natural_sizes`.
-        present: unknowns that are asked about.
-        at_bound: unknowns on a bound.
-    """
+    """Unknowns that give cause by their errors at the estimate alone."""
     se = uncertainty.se / natural
     known = present & np.isfinite(se)
     se = np.where(known, se, 0)

@@ -169,10 +169,6 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
 def as_read(curves: Sequence[Curve], level: Level) -> tuple[Sequence[Curve], str | None]:
     """Curves as a level reads them: without vectors where it presses along the normal alone.
 
-    Args:
-        curves: that the level admits.
-        level: of the model.
-
     Returns:
         The curves without their vectors, and a sentence on what was left out; None: nothing was.
     """

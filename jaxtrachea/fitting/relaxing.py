@@ -65,11 +65,6 @@ def by_records(
     """The table with times within reach of the records, where the user has not said otherwise.
 
     Times of branches begin evenly in the logarithm of the time.
-
-    Args:
-        parameters: the table.
-        options: of the model.
-        span: of the records.
     """
     count = sum(name.startswith("tau") for name in LAWS[options.branches].names)
     ratio = span.longest / span.shortest

@@ -267,10 +267,6 @@ def sentence(rows: Sequence[Row], left: str = "positions") -> str:
     Decisive is a difference of AICc of `DECISIVE` or more that remains so for as many samples as
     are independent, that no prediction of what was left out contradicts, and where the best model
     follows the curves.
-
-    Args:
-        rows: of one specimen, one per model.
-        left: what was left out, in words.
     """
     best, second = sorted(rows, key=lambda row: row.AICc)[:2]
     if not np.isfinite(best.AICc):

@@ -30,10 +30,6 @@ _NAMES = 8
 def find_files(spec: FitSpec, root: Path) -> list[Path]:
     """Files of `data.files`, patterns expanded, sorted within each pattern.
 
-    Args:
-        spec: the specification.
-        root: folder that relative paths start from.
-
     Raises:
         SpecError: a path or pattern matches nothing.
     """
@@ -137,11 +133,7 @@ def _name(curve: Curve | BadCurve) -> str:
 
 
 def _without(whole: Measurements, exclude: Sequence[str]) -> Measurements:
-    """Without the curves that are excluded, usable or not; a note names them.
-
-    Raises:
-        SpecError: a name that no curve or more than one has, or that stands twice.
-    """
+    """Without the curves that are excluded, usable or not; a note names them."""
     if not exclude:
         return whole
     count = Counter(map(_name, (*whole.curves, *whole.bad)))

@@ -16,9 +16,6 @@ def look_alikes(curves: Iterable[Curve | BadCurve]) -> list[str]:
 
     The names stay different. The cost is linear in the number of curves.
 
-    Args:
-        curves: usable or not.
-
     Returns:
         Lines with the names, in what they differ, how many curves each has, and the cure.
     """

@@ -184,11 +184,7 @@ def _check_file(path: Path) -> None:
 
 
 def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
-    """What one file holds, and what should be said of it.
-
-    Raises:
-        DataError: as `read_measurements`.
-    """
+    """What one file holds, and what should be said of it."""
     asked = reader_of(options.format)
     head = first_bytes(path, HEAD)
     for reader in READERS if asked is None else (asked,):
@@ -223,11 +219,7 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
 def _read_workbook(
     path: Path, asked: Reader | None, options: ReadOptions
 ) -> tuple[Records, list[str]]:
-    """The curves of the sheets that are meant, and which sheet was read if nobody chose several.
-
-    Raises:
-        DataError: the workbook or the table of the sheet cannot be read.
-    """
+    """The curves of the sheets that are meant, and which sheet was read if nobody chose several."""
     texts, sheets = read_sheets(path, options.sheet)
     others = listed([name for name in sheets if name not in {text.sheet for text in texts}])
     hint = f", or choose another sheet with data.sheet ({others})" if others else ""

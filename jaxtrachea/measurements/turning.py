@@ -100,10 +100,6 @@ def turning_points(values: Float64[np.ndarray, " n"], tolerance: float) -> list[
 def loadings(values: Float64[np.ndarray, " n"], points: list[int]) -> list[tuple[int, int]]:
     """Feet and peaks of the loadings between turning points, dips and partial returns within them.
 
-    Args:
-        values: the record.
-        points: its turning points.
-
     Returns:
         Pairs of samples (foot, peak) in order; none if the record only falls.
     """

@@ -155,11 +155,7 @@ def _tip(side: Side, node: _Node) -> _Node:
 
 
 def _check_shapes(beam: Beam) -> None:
-    """Refuse a beam whose spans and supports do not fit each other.
-
-    Raises:
-        ValueError: which, its length and the expected one; no beam, or one without supports.
-    """
+    """Refuse a beam whose spans and supports do not fit each other."""
     check_word("beam", beam, Beam)
     n = shaped("Beam.x", beam.x, ("any number of",)).shape[0]
     if n == 0:

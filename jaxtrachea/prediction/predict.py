@@ -74,11 +74,7 @@ def predict(
 
 
 def _times(time: ArrayLike | Sequence[float], displacement: np.ndarray) -> np.ndarray:
-    """Times as a vector.
-
-    Raises:
-        ValueError: not one for each displacement, one that is not finite, or that falls.
-    """
+    """Times as a vector."""
     t = np.atleast_1d(np.asarray(time, np.float64))
     if t.shape != displacement.shape:
         raise ValueError(

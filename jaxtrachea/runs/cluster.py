@@ -43,9 +43,6 @@ class Lost(Exception):
 def connected(address: str) -> Iterator[Any]:
     """A cluster with at least one worker.
 
-    Args:
-        address: of the scheduler, HOST:PORT.
-
     Raises:
         NoCluster: dask is not installed, nothing answers, or there is no worker.
     """

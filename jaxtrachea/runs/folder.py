@@ -182,11 +182,7 @@ def _reason(error: Exception) -> str:
 
 
 def _passed(target: Path, was: Manifest, now: Manifest, force: bool) -> list[str]:
-    """What differs, where the user forces it or has before.
-
-    Raises:
-        NoRun: something differs, and must not.
-    """
+    """What differs, where the user forces it or has before."""
     changed = [line for line in manifests.differences(was, now) if line not in was.forced]
     if was.lanes != now.lanes:
         raise NoRun(

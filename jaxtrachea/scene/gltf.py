@@ -56,10 +56,6 @@ def write_glb(path: Path, recording: Recording) -> None:
 
     Colours show wall and rings; glTF moves no colours. Between two rows everything moves evenly.
 
-    Args:
-        path: of the new file.
-        recording: see there.
-
     Raises:
         OSError: the file cannot be written.
     """

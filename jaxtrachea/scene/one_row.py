@@ -94,15 +94,7 @@ class OneRow:
         self, scene: Scene, setting: Callable, step: Callable,
         state: Array | np.ndarray, *given: Any,
     ):  # fmt: skip
-        """Compile.
-
-        Args:
-            scene: see `Row`.
-            setting: -
-            step: -
-            state: to begin with.
-            given: arrays as they are given at each call.
-        """
+        """Compile."""
         row = Row(scene, setting, step)
         row.trace(state, *given)
         self._contacts = row.contacts

@@ -50,11 +50,7 @@ def make_plan(
 
 
 def _decided(effect: Effect, case: Case) -> Decision:
-    """The level of an effect; the rules below read it in the case.
-
-    Raises:
-        PlanError: a wish that cannot be met.
-    """
+    """The level of an effect; the rules below read it in the case."""
     verdict, requested = effect.rule(case), getattr(case.options, effect.name)
     if requested in verdict.refused:
         raise PlanError(effect.name, repr(requested), *verdict.refused[requested])

@@ -128,11 +128,7 @@ def draw_surface(
 
 
 def draw_rest(scene: Scene) -> Figure:
-    """The tube at rest with its rings, from the front and the side; its colour has no meaning.
-
-    Args:
-        scene: with a mesh.
-    """
+    """The tube at rest with its rings, from the front and the side; its colour has no meaning."""
     mesh = scene.mesh
     assert mesh is not None
     wall = Triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
@@ -251,11 +247,7 @@ def inside_rings(scene: Scene, mesh: Mesh) -> np.ndarray:
 
 
 def _camera(axes: np.ndarray) -> np.ndarray:
-    """Rows right, up and towards the viewer: the larynx is right, the contact's normal is up.
-
-    Args:
-        axes: along the tube, the normal and the third as columns.
-    """
+    """Rows right, up and towards the viewer: the larynx is right, the contact's normal is up."""
     along, normal, aside = axes.T
     towards = np.cos(ASIDE) * normal + np.sin(ASIDE) * aside + TILT * along
     towards /= np.linalg.norm(towards)

@@ -26,10 +26,6 @@ def write_vtk(folder: Path, recording: Recording) -> None:
     solution has its tools alone. The wall has `displacement` (mm) and `ring` (1 on a ring), the
     contact point `force` (N), `s` (mm) and `phi` (rad).
 
-    Args:
-        folder: that exists.
-        recording: see there.
-
     Raises:
         OSError: a file cannot be written.
     """

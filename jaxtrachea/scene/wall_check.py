@@ -106,14 +106,7 @@ def checked_span(geometry: Geometry) -> tuple[float, float]:
 
 
 def measure(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> WallError:
-    """Gaps of balls beside the wall, along the rings (`checked_span`).
-
-    Args:
-        mesh: the surface.
-        geometry: its skeleton.
-        patches: of its wall.
-        count: number of balls.
-    """
+    """Gaps of balls beside the wall, along the rings (`checked_span`)."""
     centres, s, radius = _balls(mesh, geometry, count)
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     gap = _distance(vertices[faces], centres) - radius

@@ -68,12 +68,7 @@ class Cost(NamedTuple):
 
 
 def operations(arguments: Arguments, *, step: bool = False) -> float:
-    """Of `simulate` for scene, material and path; those in float32 counted half.
-
-    Args:
-        arguments: scene, material and path.
-        step: of the last row of the path alone.
-    """
+    """Of `simulate` for scene, material and path; those in float32 counted half."""
     if step:
         scene, material, path = arguments
         arguments = scene, material, last_row(path)

@@ -118,11 +118,6 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
     Against the rules (`scene.rules`): rings are arches wherever EI_C and k_t are given, the dent
     has 32 centres, contacts are `fine`.
 
-    Args:
-        spec: of the scene.
-        staged: made from it.
-        coupling: instead of that of the specification.
-
     Raises:
         PlanError: a wish that cannot be met.
     """

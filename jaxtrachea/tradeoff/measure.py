@@ -157,14 +157,7 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
 
 
 def choice_row(name: str, choice: Choice, repeat: Cost, end: dict[str, Any]) -> dict[str, Any]:
-    """A choice as a line of JSON.
-
-    Args:
-        name: of the scene.
-        choice: -
-        repeat: its time, measured once more.
-        end: what `environment` gives.
-    """
+    """A choice as a line of JSON."""
 
     def said(rungs):
         return [

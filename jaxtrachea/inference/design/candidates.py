@@ -150,11 +150,6 @@ def candidates_of(
     From ring to ring as far as all of the tool lies on the tube; of deforming cross-sections at
     every angle that was measured; on every specimen that has unknowns of its own.
 
-    Args:
-        spec: the specification.
-        study: the study.
-        reach: as in `extrapolation`.
-
     Raises:
         SpecError: as `_paces`; positions outside the tube or where the tool reaches beyond its
             ends, depths of more than its radius, angles that the model does not have, or unknowns
@@ -194,12 +189,7 @@ def candidates_of(
 def _paces(
     speed: tuple[float, ...] | None, hold: tuple[float, ...] | None, study: Study
 ) -> list[_Pace]:
-    """Every speed with every hold; left out: the slowest and the fastest, the longest measured.
-
-    Raises:
-        SpecError: of a model that knows no time; no speed where the records have none; a hold that
-            is negative.
-    """
+    """Every speed with every hold; left out: the slowest and the fastest, the longest measured."""
     if not study.model.relaxes:
         for key, given in (("speed", speed), ("hold", hold)):
             if given is not None:
@@ -238,11 +228,7 @@ def beyond_records(study: Study, speed: float, hold: float, depth: float) -> str
 
 
 def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
-    """Angles of the candidates, rad, each once.
-
-    Raises:
-        SpecError: one that the model does not press.
-    """
+    """Angles of the candidates, rad, each once."""
     if not study.model.level.off_midline:
         if asked is not None:
             raise SpecError(

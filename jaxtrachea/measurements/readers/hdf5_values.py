@@ -154,10 +154,6 @@ class _Holder(NamedTuple):
 def _plain_text(holder: Any, name: str) -> Any:
     """A text by itself, far cheaper than by `attrs`.
 
-    Args:
-        holder: identifier of a group or dataset.
-        name: of the attribute.
-
     Returns:
         Bytes; None if there is none, `_ODD` if it is of another kind or shape, or damaged.
     """

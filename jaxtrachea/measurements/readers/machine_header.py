@@ -181,11 +181,7 @@ def _titled(parts: list[Part], above: Line | None, delimiter: str) -> list[Part]
 
 
 def _numbered(text: Text, options: ReadOptions) -> tuple[Found, list[Part]]:
-    """Columns by number where there is no header.
-
-    Raises:
-        Fault: there is a header, or nobody says which columns are displacement and force.
-    """
+    """Columns by number where there is no header."""
     named = likely_header(text.lines[:MAX_PREAMBLE])
     for version in (text, text.with_tabs(1)):
         header = numbered_columns(version.lines[:MAX_PREAMBLE])
@@ -246,15 +242,6 @@ def _refuse_columns_of_tidy(
 
     With `format = "machine"` those that the options name; else all: other lines stand above, by
     which the file is no tidy table.
-
-    Args:
-        line: of the header.
-        quoted: their names, by role.
-        options: as the file is read.
-        commented: the header begins with #.
-
-    Raises:
-        Fault: there is one.
     """
     asked = options.format == "machine"
     found = {role: name for role, name in quoted.items() if not asked or role in options.columns}

@@ -53,10 +53,6 @@ def to_utf8(path: Path, data: bytes) -> bytes:
     UTF-8 (with or without mark) and UTF-16 with one are decoded; other bytes are taken for Latin-1,
     in which many instruments write µ and °. Line ends may be those of Unix, DOS or old Macs.
 
-    Args:
-        path: the file, for messages.
-        data: the text.
-
     Raises:
         DataError: it holds zero bytes.
     """

@@ -90,11 +90,7 @@ def _cells(book: Any, name: str) -> list[tuple]:
 
 
 def _chosen(path: Path, pages: dict[str, str], sheet: str | Sequence[str] | None) -> list[str]:
-    """Names of the sheets that are meant, in the order of the workbook.
-
-    Raises:
-        DataError: there is none.
-    """
+    """Names of the sheets that are meant, in the order of the workbook."""
     if not pages:
         raise DataError(
             "has no sheet with cells",
