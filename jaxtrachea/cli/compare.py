@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from jaxtrachea.cli.load import load
 from jaxtrachea.cli.options import DataOption, OutOption
-from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, table
+from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, say_written, table
 
 SpecsArgument = Annotated[
     list[Path], typer.Argument(help="Two or more fit specifications of the same curves.")
@@ -136,30 +136,25 @@ def _fitted(loaded, names, leave_out, stop_if_asked) -> list:
 
 def _write(folder: Path, specs, loaded, models, clock, left: str):
     """compare.csv, report.md, provenance.json; returns the rows, failed lanes and sentences."""
-    import json
     from hashlib import sha256 as digest
 
-    import jax
-
     from jaxtrachea.files.atomic import write_text
-    from jaxtrachea.files.provenance import provenance
+    from jaxtrachea.files.provenance import provenance, write_provenance
     from jaxtrachea.inference.comparison import compared
 
     rows, failed = compared(models)
     sentences = _sentences(rows, left)
     _table(rows).write_csv(folder / "compare.csv")
     write_text(folder / "report.md", _report(rows, sentences, failed, models, left))
-    ends = [*clock, time.perf_counter()]
-    timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
+    phases, ends = ("read", "fit", "write"), [*clock, time.perf_counter()]
     measured, precision = loaded[0][1], loaded[0][0].fit.precision
-    device = str(jax.devices()[0])
-    made = provenance(specs[0], measured.sha256(), device, precision, timings)
+    made = provenance(specs[0], measured.sha256(), precision, phases, ends)
     made["specifications"] = [
         {"file": path.name, "model": m.name, "sha256": digest(path.read_bytes()).hexdigest()}
         for path, m in zip(specs, models, strict=True)
     ]
     del made["specification"]
-    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    write_provenance(folder, made)
     return rows, failed, sentences
 
 
@@ -269,4 +264,4 @@ def _print(rows, sentences, failed: int, models, folder: Path) -> None:
         out.print(escape(note), highlight=False, emoji=False)
     if failed:
         out.print(f"{failed} specimens could not be fitted by every model and count for none")
-    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
+    say_written(folder)

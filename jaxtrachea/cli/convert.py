@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from jaxtrachea import __version__
 from jaxtrachea.cli.load import print_bad, print_notes
-from jaxtrachea.cli.terminal import Stop
+from jaxtrachea.cli.terminal import Stop, say_written
 
 PathsArgument = Annotated[
     list[Path], typer.Argument(metavar="SOURCE... TARGET", help="Data files; the new file last.")
@@ -45,7 +45,7 @@ def convert(paths: PathsArgument, spec: SpecOption = None) -> None:
     samples = sum(curve.force.size for curve in curves)
     said = f"{len(curves)} curves, {samples} samples; {len(bad)} bad curves left out"
     out.print(said, highlight=False)
-    out.print(f"written to {target}", markup=False, highlight=False, soft_wrap=True)
+    say_written(target)
     raise typer.Exit(1 if bad else 0)
 
 

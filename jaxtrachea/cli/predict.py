@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from jaxtrachea.cli.load import print_bad
 from jaxtrachea.cli.predict_data import measured_curves
-from jaxtrachea.cli.terminal import Stop, into, say_lost, set_up_jax, table, to_stderr
+from jaxtrachea.cli.terminal import Stop, into, say_lost, say_written, set_up_jax, table, to_stderr
 
 ResultsArgument = Annotated[
     Path, typer.Argument(help="Folder of a finished fit, or its results.h5.")
@@ -229,7 +229,6 @@ def _show(title: str, shown) -> None:
 
 
 def _end(lines: Sequence[str], folder: Path) -> None:
-    out = Console()
     for line in lines:
-        out.print(escape(line), highlight=False)
-    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
+        Console().print(escape(line), highlight=False)
+    say_written(folder)

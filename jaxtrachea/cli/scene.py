@@ -18,6 +18,7 @@ from jaxtrachea.cli.terminal import (
     into,
     progress_bar,
     say_lost,
+    say_written,
     set_up_jax,
     table,
 )
@@ -70,6 +71,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     """Move the tool along its path: forces, deformed mesh, pictures."""
     import jax
 
+    from jaxtrachea.files.provenance import write_provenance
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.results import (
         last_solved,
@@ -112,7 +114,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 lost = _write_play(folder, title) if spec.output.play else {}
                 if spec.output.vtk or spec.output.animation:
                     _write_recording(folder, spec.output)
-                _write_json(folder, made)
+                write_provenance(folder, made)
                 lost |= drawing.result()
         say_lost(lost)
     _print_rows(out, staged.scene.names)
@@ -123,7 +125,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
         Console().print(escape(choice.sentence), highlight=False)
     if last_solved(out) is None:
         Console().print("no row was solved: no mesh, no picture of the surface")
-    Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    say_written(folder.parent)
     raise typer.Exit(1 if failed else 0)
 
 
@@ -133,6 +135,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import numpy as np
 
     from jaxtrachea.files.pictures import save_each
+    from jaxtrachea.files.provenance import write_provenance
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.plots import draw_sweep
     from jaxtrachea.scene.results import write_sweep
@@ -170,7 +173,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
         if spec.output.vtk and (mesh := staged.scene.mesh) is not None:
             write_map(folder / "sweep.vtp", mesh, s, phi, out)
-        _write_json(folder, made)
+        write_provenance(folder, made)
     unsolved = int(np.isnan(np.asarray(out.force)).sum())
     console = Console()
     console.print(escape(_levels_of(swept)), highlight=False)
@@ -179,7 +182,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         f"{clock[2] - clock[1]:.2f} s with compilation", highlight=False,
     )  # fmt: skip
     failed = _print_failures(out.status, "point(s)")
-    console.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    say_written(folder.parent)
     raise typer.Exit(1 if failed else 0)
 
 
@@ -361,17 +364,8 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
     from jaxtrachea.files.provenance import provenance
 
     inputs = {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in staged.files}
-    seconds = {name: clock[i + 1] - clock[i] for i, name in enumerate(("read", "compute"))}
     dtype = str(jax.tree.leaves(staged.material)[0].dtype)
-    return provenance(scene, inputs, str(jax.devices()[0]), dtype, seconds)
-
-
-def _write_json(folder: Path, made: dict) -> None:
-    import json
-
-    from jaxtrachea.files.atomic import write_text
-
-    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    return provenance(scene, inputs, dtype, ("read", "compute"), clock)
 
 
 def _print_failures(status, what: str) -> int:

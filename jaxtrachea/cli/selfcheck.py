@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from jaxtrachea.cli.terminal import Stop, set_up_jax, table
+from jaxtrachea.cli.terminal import Stop, say_written, set_up_jax, table
 
 DtypeOption = Annotated[str, typer.Option("--dtype", help="Precision: float32, float64 or both.")]
 OnlyOption = Annotated[
@@ -60,7 +60,7 @@ def selfcheck(
     out.print(_summary(found, failed, seconds), highlight=False)
     if out_dir is not None:
         _write(out_dir, found, seconds, quick)
-        out.print(f"written to {out_dir}", markup=False, highlight=False, soft_wrap=True)
+        say_written(out_dir)
     raise typer.Exit(1 if failed else 0)
 
 

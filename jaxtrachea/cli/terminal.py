@@ -28,7 +28,7 @@ from jaxtrachea.files.programs import count_uses, keep_bounds
 
 __all__ = [
     "Kept", "Stages", "Stop", "cache_folder", "complain", "interrupts", "into", "programs_folder",
-    "progress_bar", "quiet_compiler", "say_lost", "set_up_jax", "table", "to_stderr",
+    "progress_bar", "quiet_compiler", "say_lost", "say_written", "set_up_jax", "table", "to_stderr",
 ]  # fmt: skip
 
 
@@ -60,6 +60,11 @@ def say_lost(pictures: Mapping[str, str]) -> None:
     """Warn of pictures that could not be drawn; the numbers stand."""
     for name, reason in pictures.items():
         to_stderr(f"[yellow]warning:[/] {escape(sentence(name, reason))}")
+
+
+def say_written(path: Path) -> None:
+    """Where the files of a command are."""
+    Console().print(f"written to {escape(str(path))}", highlight=False, soft_wrap=True)
 
 
 class Interrupts:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
+from jaxtrachea.cli.terminal import Stop, say_written, set_up_jax, to_stderr
 
 PortOption = Annotated[
     int | None, typer.Option("--port", min=1, max=65535, help="Of 127.0.0.1; none: a free one.")
@@ -123,7 +123,7 @@ def play(
         raise Stop(str(error)) from None
     except OSError as error:
         raise Stop(f"{path}: cannot be written ({error.strerror}); choose another --out") from None
-    Console().print(f"written to {escape(str(path))}", highlight=False, soft_wrap=True)
+    say_written(path)
 
 
 def _open(address: str) -> bool:
