@@ -24,7 +24,6 @@ def beside(function: Callable, *arguments: Any) -> Iterator[Future]:
 
     Args:
         function: called once; what it raises is raised by `Future.result`.
-        arguments: of the function.
     """
     with ThreadPoolExecutor(1, "beside") as pool:
         yield pool.submit(function, *arguments)

@@ -202,8 +202,6 @@ def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False)
     Levenberg-Marquardt get one dense lane in place of the joint study.
 
     Args:
-        spec: the specification.
-        measurements: what to fit.
         refits: something that refits lanes was asked for outside the specification.
 
     Raises:

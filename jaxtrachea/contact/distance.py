@@ -107,7 +107,6 @@ def signed_distance(
         a: shape A.
         b: shape B, of the same dtype.
         pose: from B's frame to A's.
-        settings: accuracy and work.
         beta: sharpness, 1/mm, positive; default `settings.sharpness` over the size of the pair,
             without the derivative of that size.
         table: `direction_table(a, settings)`, to share it between poses.

@@ -358,7 +358,6 @@ def find_normal(pair: Pair, table, centre, settings: Settings):
         pair: the two shapes.
         table: max_i v_i . d of A over the coarse directions.
         centre: unit vector from the centre of A to that of B.
-        settings: the work to be done.
     """
     s = settings
     first = jnp.minimum(jnp.asarray(FIRST_SHARPNESS, pair.beta.dtype), pair.beta)

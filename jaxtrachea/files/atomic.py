@@ -33,7 +33,6 @@ def write_whole(path: Path, data: bytes) -> None:
 
     Args:
         path: file, replaced if it exists.
-        data: its content.
 
     Raises:
         OSError: nothing was written; a file of that name is as it was.
@@ -107,7 +106,6 @@ def hdf5_file(path: Path, mode: str = "x") -> Iterator[Any]:
     """An HDF5 file that is in its place when the block ends; nothing is if it raises.
 
     Args:
-        path: of the file.
         mode: `x`: new; `r+`: one that exists, with more written into it.
 
     Yields:

@@ -43,7 +43,6 @@ def save_each(
     `Figure.savefig` goes through a figure twice, the first time without drawing it.
 
     Args:
-        folder: where to.
         drawings: file name, with its ending (`png` or `svg`), to what returns the figure.
 
     Returns:

@@ -40,9 +40,7 @@ def provenance(
     """Everything needed to repeat a run: versions, device, dtype, SHA-256 of every input.
 
     Args:
-        spec: the specification file.
         inputs: SHA-256 by measurement file.
-        dtype: of the computation.
         phases: names of what was done, one after the other.
         clock: when the first began, and when each ended, s.
     """

@@ -32,7 +32,6 @@ def load_spec(
     """Read and validate a specification of any kind.
 
     Args:
-        path: the TOML file.
         kind: the record it must fit.
         called: what a user calls it.
         others: a table that only another kind of file has, and what that file is.

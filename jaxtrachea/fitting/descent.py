@@ -35,7 +35,6 @@ def cost(
     """Half the weighted sum of rho(residual^2) of one lane; differentiable in all arrays.
 
     Args:
-        model: what is fitted (static).
         theta: unknowns in scaled coordinates (`Parameter.to_scaled`).
         lane: arrays of the lane.
         sigma: standard deviation of force and markers in units of the lane's precision.

@@ -38,7 +38,6 @@ def fitted_errors(result: FitResult, lanes: Int[np.ndarray, " n"]) -> FittedErro
     """Standard errors of the fitted values, and residuals over their standard deviation.
 
     Args:
-        result: the fit.
         lanes: which lanes.
     """
     study = result.study

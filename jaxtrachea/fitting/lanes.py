@@ -144,7 +144,6 @@ def unknowns_of(
 
     Args:
         lane: its curves.
-        parameters: the table.
         taken: what each curve takes of the free parameters that are `auto`; None: all.
     """
     names: dict[Unknown, None] = {}
@@ -246,8 +245,6 @@ def lanes_of(
     Args:
         groups: curves of each lane.
         unknowns: of each lane.
-        parameters: the table.
-        geometry: the tube.
         noise: known standard deviations.
         weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
         tool_radius: see `build.build_study`.

@@ -108,7 +108,6 @@ def values_of(model: FitModel, free, value) -> dict[str, Any]:
     """Every parameter of one trial in its unit, by name.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates; (F,).
         value: all parameters in their units, used where they are not free; (J,).
     """

@@ -143,7 +143,6 @@ def natural_sizes(
     coefficient k_n of the local law against that force over the depth to the power n.
 
     Args:
-        study: the study.
         relative: as `FitResult.relative`.
         first_touch: as `FitResult.first_touch`, mm.
     """

@@ -180,8 +180,6 @@ def defaults_of(
     wall give for this tube (`from_wall`; of rings with pitches of their own the median).
 
     Args:
-        options: of the model.
-        geometry: the tube.
         wall: moduli and thicknesses; None: those of the paper and the virtual specimen.
         tool_radius: mm, which the local contact begins with; None: that of the virtual specimen's.
 

@@ -115,7 +115,6 @@ def relaxed_value(
     Of a skeleton that softens the force of small strain relaxes (`press_in_time`).
 
     Args:
-        model: what is fitted (static).
         values: every parameter of the trial by name.
         time: s.
         elastic: press.
@@ -138,7 +137,6 @@ def relaxed_press(
     """A press as its force relaxes, see `relaxed_value`, with its derivatives.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units.
         time: s.
@@ -206,7 +204,6 @@ def parts_press(
     """A press whose local law and skeleton relax apart, with its derivatives.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units.
         time: s.

@@ -75,9 +75,7 @@ def inputs(
     """What the curves of one lane see of its unknowns.
 
     Args:
-        model: what is fitted (static).
         theta: unknowns in scaled coordinates.
-        lane: the lane's arrays (no leading axis).
         geometry: the tube, may be traced; None: of the model.
 
     Raises:
@@ -104,9 +102,7 @@ def residual(
     """Residuals of one lane and their Jacobian, trial by trial.
 
     Args:
-        model: what is fitted (static).
         theta: unknowns in scaled coordinates.
-        lane: the lane's arrays (no leading axis).
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
@@ -406,7 +402,6 @@ def force_jacobian(
     Shape (Jf, N); where the motion has an angle, after it those of `names`.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
         motion: of the tool; its onset is that of the parameters.

@@ -87,7 +87,6 @@ def asked_by_fits(study: Study, value: Float[np.ndarray, "lanes P"]) -> list[Fit
     """Curves that take an onset or a force offset which their fits ask for, with the estimates.
 
     Args:
-        study: of the fit.
         value: estimates, in the parameters' units.
     """
     shown = study.record_zeros

@@ -17,7 +17,6 @@ def with_holdout_groups(
     """The study with trials that no fit without one of them may see another of.
 
     Args:
-        study: the study.
         groups: names of trials; of each specimen those of a group are left out together.
         unusable: curves that are known, but not in the study.
 

@@ -140,8 +140,6 @@ def write_hdf5(
     The file is written beside its place and then moved there, so it is complete or absent.
 
     Args:
-        path: the file to write.
-        measurements: the curves.
         attrs: further root attributes, such as licence and source.
         overwrite: replace an existing file.
 

@@ -211,7 +211,6 @@ def _foot(travel: np.ndarray, points: list[int], corners: list[int], foot: int) 
     """Where a loading begins in air: its last return there, else the lowest place since.
 
     Args:
-        travel: the record.
         points: turning points of what counts of it.
         corners: its own turning points.
         foot: where what counts of the loading begins.

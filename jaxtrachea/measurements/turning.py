@@ -63,7 +63,6 @@ def turning_points(values: Float64[np.ndarray, " n"], tolerance: float) -> list[
     Minima and maxima alternate; of equal minima the last counts, of equal maxima the first.
 
     Args:
-        values: the record.
         tolerance: largest reversal that is none, in the unit of `values`.
 
     Returns:

@@ -73,7 +73,6 @@ def usage(
         displacement: (N,) mm, of the record.
         keep: (N,) samples of the curve.
         found: segments of the record; None: it only unloads.
-        loading: the loading rule.
         unit: of the duration of holds, ``"s"`` or ``"samples"``.
         faulty: samples left out after a break or on a flat top, and what is said of the record.
 

@@ -150,7 +150,6 @@ def usage_section(
     """The section of the report, if there is anything to say.
 
     Args:
-        curves: as they are used.
         notes: what else should be known of how they were read, a sentence each.
         more: further sentences on the curves.
     """

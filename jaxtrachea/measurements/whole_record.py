@@ -101,7 +101,6 @@ def remarks_of(
     Args:
         time: s.
         displacement: mm, of the record.
-        found: its segments.
         whole: the record is used as it went.
     """
     speeds = {

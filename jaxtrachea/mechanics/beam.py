@@ -120,7 +120,6 @@ def _reach(
     A ring exactly at C belongs to side A.
 
     Args:
-        beam: the beam.
         s_c: mm.
         written_out: a comparison for each ring and no sum over them, which of many lanes no single
             kernel can make (`fusion.REDUCED`).

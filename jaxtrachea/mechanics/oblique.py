@@ -372,10 +372,8 @@ def assemble(unit: Skeleton, force, depth, status, load=None) -> ObliquePress:
     """The skeleton's response times the forces; the ring's status where it has one.
 
     Args:
-        unit: -
         force: of the contact, which the rings bear.
         depth: local indentation.
-        status: -
         load: elastic force that the shape follows; None: the force.
     """
     load = force if load is None else load

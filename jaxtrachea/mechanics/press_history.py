@@ -68,7 +68,6 @@ def at_rest(relaxation: Relaxation, options: Options, vector: bool) -> History:
     """Before the first press, in the dtype of the branches.
 
     Args:
-        relaxation: the branches.
         options: whether parts relax apart (static).
         vector: whether presses are vectors (static).
     """
@@ -191,10 +190,7 @@ def _alike(elastic, depth, law: Law, way, status, options: Options, samples: Sam
     Args:
         elastic: elastic force, N; a vector has its inward component first.
         depth: elastic indentation, mm.
-        law: local law.
         way: displacement under an elastic force, mm.
-        status: of the elastic press.
-        options: static.
         samples: times and history.
     """
     unilateral, branches = options.contact == "unilateral", samples.relaxation.local

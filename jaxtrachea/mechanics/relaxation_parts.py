@@ -102,7 +102,6 @@ def relax_parts_with_derivatives(
         time: s; as in `relax_parts`, with the next three.
         displacement: mm.
         compliance: mm/N.
-        law: local law.
         branches: of the local law and of the skeleton.
         along: directions of the derivatives.
         unilateral: as in `relax_parts` (static).
@@ -136,9 +135,6 @@ def _loop(local, skeleton, displacement, compliance, law: Law, unilateral: bool 
         local: x, lost and gamma of the local law, see `relaxation.steps`.
         skeleton: those of the skeleton.
         displacement: (N, *lanes).
-        compliance: of the skeleton.
-        law: local law.
-        unilateral: static.
     """
     (x, lost, gamma), (x_s, lost_s, gamma_s) = local, skeleton
 
@@ -160,9 +156,6 @@ def one_sample(before, fading, displacement, compliance, law: Law, unilateral: b
             skeleton, N.
         fading: `factors` of the local law, and of the skeleton.
         displacement: after first touch, mm.
-        compliance: of the skeleton.
-        law: local law.
-        unilateral: static.
     """
     h, e, q, y = before
     (kept, _, share), (kept_s, _, share_s) = fading
@@ -241,13 +234,9 @@ def _loop_with_derivatives(
 
     Args:
         local: see `_loop`, with the next four.
-        skeleton: of the skeleton.
         displacement: (N, *lanes).
-        compliance: of the skeleton.
-        law: local law.
         along: changes, of gamma and of log tau each (B, K, *lanes), of the displacement
             (N, K, *lanes), of compliance and coefficients (K, *lanes).
-        unilateral: static.
     """
     (x, lost, gamma), (x_s, lost_s, gamma_s) = local, skeleton
     barrier = jax.lax.optimization_barrier

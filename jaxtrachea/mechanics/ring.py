@@ -169,7 +169,6 @@ def ring_compliance(
     """Level `arch2`: displacement of the ring at phi_c per unit load (P_y, P_z) there.
 
     Args:
-        ring: section and supports.
         phi_c: angle of the load from the anterior midline, rad, in (-pi, pi].
         order: Gauss-Legendre points on each side of the load. For alpha = 2 pi / 3: 4 leave 1e-3,
             6 leave 2e-6, 8 leave 1e-9, 12 rounding.
@@ -198,7 +197,6 @@ def support_stiffness(
     """Stiffness of the ring as the support of a beam that bends in one plane.
 
     Args:
-        ring: section and supports.
         phi_c: angle of the joint, rad, in (-pi, pi].
         direction: (y, z) of the load, of any length but 0; a normal press at phi_c has
             (cos phi_c, sin phi_c).
@@ -229,7 +227,6 @@ def respond(
     move by P_z / k_M and apart by `opening`. The spring of end U carries k_M / 2 * end_U.
 
     Args:
-        ring: section and supports.
         phi_c: angle of the load, rad, in (-pi, pi].
         load: (P_y, P_z), N.
         order: as in `ring_compliance`.
@@ -269,7 +266,6 @@ def ring_influence(
     the motion of U and V. Reciprocal: the influence of phi on phi_c is its transpose.
 
     Args:
-        ring: section and supports.
         phi: angle of the observed point, rad, in [-alpha, alpha].
         phi_c: angle of the load, rad, in [-alpha, alpha].
         order: Gauss-Legendre points on each of three pieces, see `ring_compliance`.

@@ -47,7 +47,6 @@ def validate(
     """Check what a press is asked.
 
     Args:
-        geometry: the tube at rest.
         material: its shapes are checked, all of them.
         s_c: contact position, mm.
         used: names of the values of the material that the model reads and that must not be

@@ -114,7 +114,6 @@ def compare(
     was fitted, its corner is rounded as the fit does it.
 
     Args:
-        stored: the fit.
         curves: from `pressable`.
         as_specimen: of the fit, in the place of one that it does not know.
     """
@@ -242,7 +241,6 @@ def measured_corners(
     """Rounded corner at the onset of new curves, mm, as the fit has its own; NaN without an onset.
 
     Args:
-        stored: the fit.
         curves: new ones, alone or of any specimen.
         sigmas: noise of their samples; counts where that of the fit was given.
     """

@@ -41,7 +41,6 @@ def prediction_rows(p: CurvePrediction, curve: Curve | None = None) -> Iterator[
     """One row per displacement; the band is that of a new sample.
 
     Args:
-        p: the prediction.
         curve: as measured, if it was.
     """
     low, high = p.low95, p.high95
@@ -99,7 +98,6 @@ def joint_rows(
     """One row per displacement of `at` and ring: deflection and reaction with their bands.
 
     Args:
-        p: the prediction.
         rings: ring positions, mm.
         at: which displacements.
         measured: marker displacement, mm, NaN where there was none; (N, rings).

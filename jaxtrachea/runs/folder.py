@@ -117,7 +117,6 @@ def go_on(target: Path, now: Manifest, *, force: bool = False) -> RunFolder:
     """The unfinished run in `target`.
 
     Args:
-        target: its folder.
         now: what would be run now.
         force: go on even if something has changed that decides the numbers.
 

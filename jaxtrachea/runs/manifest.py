@@ -77,10 +77,8 @@ def describe(
     """The manifest of a run that starts now.
 
     Args:
-        spec: the specification file.
         root: folder of the data.
         inputs: SHA-256 by measurement file.
-        dtype: of the computation.
         device: kind of device.
         sizes: the other attributes of `Manifest`.
     """

@@ -76,7 +76,6 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     """Read what the specification names and choose the program.
 
     Args:
-        spec: the scene.
         folder: that relative file names start from.
         counted: begins a stage of the work of this name; returns what its steps are told to.
 

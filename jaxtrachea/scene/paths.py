@@ -33,7 +33,6 @@ def path_of(
     """The path of a scene; of several tools by name: legs of one tool follow one another.
 
     Args:
-        spec: the scene.
         folder: that relative file names start from.
         files: that were read; those of the path are added.
         geometry: of the tube that it presses.
@@ -201,7 +200,6 @@ def read_table(
     """Columns of a CSV file with units in its header, by name.
 
     Args:
-        path: of the file.
         key: that names it.
         needed: lengths, mm.
         optional: dimension of those that may lack.

@@ -21,7 +21,6 @@ def make_plan(
     """Choose the program of a scene.
 
     Args:
-        facts: of the scene.
         options: of the user.
         finest: effects whose level in `options` is not the user's wish, but the finest.
 

@@ -69,7 +69,6 @@ def tool_triangles(tool: Shape, count: int = DIRECTIONS) -> Triangles:
     point, a line or a plate without a radius is drawn with `THINNEST`.
 
     Args:
-        tool: -
         count: directions.
     """
     parts = [_triangles(part, count) for part in parts_of(tool)]
@@ -110,7 +109,6 @@ def tool_distance(tool: Shape, points: np.ndarray, count: int = 4000) -> np.ndar
     part's size.
 
     Args:
-        tool: -
         points: in its frame; shape (points, 3).
         count: directions.
     """

@@ -68,7 +68,6 @@ def write_map(path: Path, mesh: Mesh, s: np.ndarray, phi: np.ndarray, out: Sweep
 
     Args:
         path: of a .vtp file.
-        mesh: of the scene.
         s: of the grid, mm; 2 or more.
         phi: of the grid, rad; 2 or more.
         out: of its points, s by s.

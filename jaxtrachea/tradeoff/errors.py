@@ -48,8 +48,6 @@ def compare(
     another mesh are interpolated at the reference's vertices.
 
     Args:
-        found: -
-        reference: -
         scenes: of both.
         gradients: from `levels.solve`, of both; or None.
     """

@@ -42,9 +42,6 @@ def measure(
     """Errors and times of every rung of the scene's ladders; then a dict for each left out.
 
     Args:
-        name: of the scene.
-        full: the scene at its finest.
-        settings: -
         report: called with what is done next.
         curves: measured curves of the scene's specimen; or none.
         radius: markers no further from the contact say nothing, mm; negative: all count.
@@ -63,10 +60,7 @@ def measure_ladders(
     Each ladder is measured against its finest rung in float64, all else at its finest level.
 
     Args:
-        name: of the scene.
-        full: the scene at its finest.
         measured: the ladders.
-        settings: -
         report: called with what is done next.
         curves: as for `measure`.
         radius: likewise.

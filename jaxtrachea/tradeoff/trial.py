@@ -33,7 +33,6 @@ class Trial:
         """Run the full program.
 
         Args:
-            full: the scene at its finest.
             report: called with what is tried next; may raise to stop.
         """
         self.full, self.report = full, report

@@ -97,7 +97,6 @@ def reached(study: Study, touch: Float[np.ndarray, "lanes T"] | None = None) -> 
     """Least and largest depth of the curves, mm from first touch.
 
     Args:
-        study: the study.
         touch: as `FitResult.first_touch`; None: as `Study.first_touch` has it before a fit.
     """
     options = study.model.options
@@ -115,7 +114,6 @@ def extrapolation(study: Study, depth: float, reach: tuple[float, float] | None 
     """What of a press goes deeper than the curves did, or the model was tested; "" if nothing.
 
     Args:
-        study: the study.
         depth: mm from first touch.
         reach: of the curves, as `reached` has it of the fit; None: as before a fit.
     """
@@ -216,7 +214,6 @@ def beyond_records(study: Study, speed: float, hold: float, depth: float) -> str
     """Whether a press of so long is longer than the records; "" if not.
 
     Args:
-        study: the study.
         speed: mm/s.
         hold: s.
         depth: mm from first touch.

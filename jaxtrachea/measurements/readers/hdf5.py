@@ -54,7 +54,6 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read every curve; a fault in the values of one costs this curve only.
 
     Args:
-        path: the file.
         options: units for datasets that have none.
 
     Returns:

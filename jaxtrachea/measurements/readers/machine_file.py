@@ -22,7 +22,6 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     Repeated rows and initial offsets are left as they are.
 
     Args:
-        text: of the file.
         options: columns, units and naming.
 
     Returns:

@@ -44,7 +44,6 @@ def opened(
     """Open an HDF5 file for reading after walking through all of it.
 
     Args:
-        path: the file.
         audit: walk through it; without that only names may be asked for, no value be read.
         read: groups and datasets, from the root, whose values will be read; None: all. Others may
             hold text, and as much as they like.

@@ -53,7 +53,6 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read a tidy table; see docs/measurements.md for the format.
 
     Args:
-        text: of the file.
         options: columns, units and naming.
 
     Returns:

@@ -35,7 +35,6 @@ def read_sheets(path: Path, sheet: str | Sequence[str] | None) -> tuple[list[Tex
     file does not store stands as its text, ``=B2*2``, which is no number.
 
     Args:
-        path: the workbook.
         sheet: name or pattern of the sheets, or several; None: the first that is not hidden.
 
     Returns:

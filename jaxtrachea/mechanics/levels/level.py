@@ -244,7 +244,6 @@ class Level(abc.ABC):
         """Why it cannot press a curve on the tube; None: it can.
 
         Args:
-            curve: as measured.
             size: of the tube.
             onset: displacement at first touch, mm: held there, or the first guess.
         """

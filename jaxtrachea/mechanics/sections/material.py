@@ -335,7 +335,6 @@ def furthest_proportion(geometry: Geometry, wall: Wall, tool_radius: float) -> s
     """The proportion that is least like the specimen's, in words; empty: `Factors` hold.
 
     Args:
-        geometry: the tube.
         wall: moduli and thicknesses.
         tool_radius: of the tool's flat end, mm.
     """
@@ -361,7 +360,6 @@ def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Arr
     the tool's radius.
 
     Args:
-        geometry: the tube.
         wall: moduli and thicknesses.
         tool_radius: of the tool's flat end, mm.
     """

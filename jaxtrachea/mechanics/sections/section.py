@@ -142,7 +142,6 @@ def make_grid(shape: Shape, *, midline: bool) -> Grid:
     """The quadrature of a cross-section.
 
     Args:
-        shape: the cross-section.
         midline: half a ring, for symmetric modes only.
     """
     dtype = shape.radius.dtype
@@ -203,7 +202,6 @@ def close_ring(
     Args:
         turn: rotation of the modes alone, at the points.
         stretch: 1 + eps there.
-        grid: the quadrature.
     """
 
     def step(state):
@@ -283,9 +281,7 @@ def energy(q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape) -> F
 
     Args:
         q: modes, mm; (4,) on the midline, else (8,).
-        ring: stiffness.
         grid: of this shape.
-        shape: the cross-section.
     """
     return line_energy(deform(q, grid, shape), ring, grid, shape)
 
@@ -317,7 +313,6 @@ def surface_motion(
         q: modes, mm.
         phi: rad, in [-alpha, alpha].
         grid: of this shape.
-        shape: the cross-section.
 
     Returns:
         Along the inward normal and along the circumference at phi.

@@ -196,7 +196,6 @@ def surface_tangent(
         phi: angle of the point on the cartilage, rad.
         force: inward and, unless it has one entry, along the circumference, N.
         grid: of the line.
-        shape: the cross-section.
     """
     way = way_to(line, phi, grid, shape)
     y, z = way.motion
