@@ -47,8 +47,6 @@ class Row:
         cost: of the fits, summed; with estimated noise each model has its own unit of it.
         deviance: -2 ln L, summed.
         AIC: summed over lanes, as are AICc and BIC.
-        AICc: -
-        BIC: -
         delta: AICc less the smallest of the models.
         weight: Akaike weight.
         left_out: rms force residual of what was left out, over the largest force of the lane; of

@@ -232,13 +232,8 @@ def press_path(
 
     Args:
         geometry: as for `press_oblique`, like all that is not named here.
-        material: -
-        s_c: -
-        phi_c: -
         displacement: of the tool at the end of each step, from rest, mm; (steps, 3).
         friction: between tool and surface.
-        options: -
-        onset: -
 
     Returns:
         The `ObliquePath`; OFF_TUBE, BAD_MATERIAL (also: a negative mu) and NON_FINITE where it is

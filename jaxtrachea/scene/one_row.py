@@ -84,11 +84,7 @@ class Row:
 
 
 class OneRow:
-    """A compiled program, and the state that its next call begins with.
-
-    Attributes:
-        state: -
-    """
+    """A compiled program, and the state that its next call begins with."""
 
     def __init__(
         self, scene: Scene, setting: Callable, step: Callable,

@@ -317,7 +317,6 @@ class Changeable(NamedTuple):
     """What may change from step to step: an argument of the program, not a constant in it.
 
     Attributes:
-        material: -
         tool: its shape about its own origin; None: several, which stay.
         footprint: of the scene, which goes with the tool.
     """

@@ -58,7 +58,6 @@ class Levels:
         steps: Newton steps of the contact (`warm_steps`).
         mesh: vertices round and along the tube, against those of the scene.
         kept: number of rings nearest to the load.
-        dtype: -
     """
 
     plan: Plan
@@ -91,8 +90,6 @@ class Full(NamedTuple):
 
     Attributes:
         scene: with the finest plan.
-        material: -
-        path: -
         levels: what that plan and the finest of all else are.
         facts: of the scene.
         options: of the user, what was `auto` at its finest.
