@@ -49,6 +49,8 @@ def compare(
     leave_out: LeaveOutOption = _LeaveOut.positions,
 ) -> None:
     """Fit the same curves by several models and rank these."""
+    from jaxtrachea.inference.repeats import repeats
+
     clock = [time.perf_counter()]
     if len(specs) < 2:
         raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")
@@ -63,7 +65,7 @@ def compare(
     with into(out_dir, default) as (folder, stop_if_asked):
         models = _fitted(loaded, names, left, stop_if_asked)
         clock.append(time.perf_counter())
-        words = _left_out_words(models, leave_out.value)
+        words = repeats(models[0].result.study, leave_out.value).words or "curves"
         rows, failed, sentences = _write(folder, specs, loaded, models, clock, words)
     _print(rows, sentences, failed, models, folder.parent)
     raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
@@ -167,13 +169,6 @@ def _sentences(rows, left: str) -> dict[str, str]:
         own = [row for row in rows if row.specimen == specimen]
         sentences[specimen] = sentence(own, left)
     return sentences
-
-
-def _left_out_words(models, leave_out) -> str:
-    """What was left out, in words; "curves" if nothing was."""
-    from jaxtrachea.inference.repeats import repeats
-
-    return repeats(models[0].result.study, leave_out).words or "curves"
 
 
 def _left_out_notes(models) -> list[str]:

@@ -158,7 +158,8 @@ def _expanded(paths: Sequence[Path]) -> list[Path]:
     files: dict[Path, None] = {}
     for path in paths:
         if path.is_dir():
-            inside = [p for p in sorted(path.iterdir()) if p.is_file() and _is_data(p)]
+            shown = (p for p in sorted(path.iterdir()) if p.is_file() and p.name[:1] != ".")
+            inside = [p for p in shown if p.name.lower().endswith(ENDINGS)]
             if not inside:
                 known = ", ".join(ENDINGS)
                 raise Stop(f"{path}: a folder without data files ({known}); name the files")
@@ -175,10 +176,6 @@ def _expanded(paths: Sequence[Path]) -> list[Path]:
             )
         files[path] = None
     return list(files)
-
-
-def _is_data(path: Path) -> bool:
-    return path.name.lower().endswith(ENDINGS) and not path.name.startswith(".")
 
 
 def _options(keys: dict[str, Any]):

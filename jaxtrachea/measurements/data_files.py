@@ -44,10 +44,12 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
             ) from None
         files = [path for path in matches if path.is_file()]
         if not files:
-            raise SpecError(
-                f"data.files.{i}: {_short(pattern)} matches in {root} "
-                f"{_what(matches) if matches else _nothing(root / pattern)}"
-            )
+            what = "a device or a pipe; expected a file"
+            if not matches:
+                what = _nothing(root / pattern)
+            elif matches[0].is_dir():
+                what = "a folder; list the files in it, as in 'folder/*.csv'"
+            raise SpecError(f"data.files.{i}: {_short(pattern)} matches in {root} {what}")
         found.update(dict.fromkeys(files))
     return list(found)
 
@@ -55,13 +57,6 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
 def _short(pattern: str) -> str:
     """A pattern for a message."""
     return repr(pattern if len(pattern) < 200 else f"{pattern[:196]} ...")
-
-
-def _what(matches: list[Path]) -> str:
-    """What a pattern leads to that is no file, and the cure."""
-    if matches[0].is_dir():
-        return "a folder; list the files in it, as in 'folder/*.csv'"
-    return "a device or a pipe; expected a file"
 
 
 def _nothing(path: Path) -> str:
@@ -164,20 +159,11 @@ def _read_one(path: Path, options: ReadOptions) -> Measurements:
     try:
         return read_measurements([path], options.of_file(path))
     except DataError as error:
-        bad = BadCurve(
-            path.stem,
-            "(all)",
-            str(path),
-            "unreadable",
-            _own(error, path),
-            error.remedy or "repair the file or leave it out",
-        )
+        within = "" if error.place in ("", str(path)) else f"{error.place}: "
+        cure = error.remedy or "repair the file or leave it out"
+        problem = f"{within}{error.problem}"
+        bad = BadCurve(path.stem, "(all)", str(path), "unreadable", problem, cure)
         return Measurements((), (bad,), (path,))
-
-
-def _own(error: DataError, path: Path) -> str:
-    """What is wrong, without the path; with the place in the file, if the error has one."""
-    return error.problem if error.place in ("", str(path)) else f"{error.place}: {error.problem}"
 
 
 def _refuse_twice(parts: list[Measurements]) -> None:

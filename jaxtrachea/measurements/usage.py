@@ -143,7 +143,7 @@ def _mixed(found: Segments, unit: str, loading: str) -> Iterator[str]:
     others = []
     holds = (*found.steps, *(() if found.hold is None else (found.hold,)))
     if holds:
-        longest = max(holds, key=_duration)
+        longest = max(holds, key=lambda hold: hold.duration)
         others.append(f"a hold of {lasting(longest, unit)} ({_relaxing(holds)})")
     if found.loadings > 1:
         others.append(f"{found.loadings} loadings")
@@ -151,7 +151,3 @@ def _mixed(found: Segments, unit: str, loading: str) -> Iterator[str]:
         others.append("unloading")
     if others:
         yield f"every sample is used, with {' and '.join(others)}: an elastic fit mixes them"
-
-
-def _duration(hold: Hold) -> float:
-    return hold.duration

@@ -101,25 +101,24 @@ def _triangles(shape: Shape, count: int) -> Triangles:
     return Triangles(vertices, faces)
 
 
-def tool_distance(tool: Shape, points: np.ndarray, count: int = 4000) -> np.ndarray:
+def tool_distance(tool: Shape, points: np.ndarray) -> np.ndarray:
     """Signed distance of points from a tool about its own origin, mm; negative inside.
 
     Of each convex part it is the largest of d . x - h(d) over directions d, with the support
-    function h: the normals of the faces and `count` others. The error is below a hundredth of the
+    function h: the normals of the faces and 4,000 others. The error is below a hundredth of the
     part's size.
 
     Args:
         points: in its frame; shape (points, 3).
-        count: directions.
     """
-    return np.min([_distance(part, points, count) for part in parts_of(tool)], axis=0)
+    return np.min([_distance(part, points) for part in parts_of(tool)], axis=0)
 
 
-def _distance(shape: Shape, points: np.ndarray, count: int) -> np.ndarray:
+def _distance(shape: Shape, points: np.ndarray) -> np.ndarray:
     """`tool_distance` of one convex body."""
     from scipy.spatial import ConvexHull, QhullError
 
-    ways, corners = sphere_directions(count), np.asarray(shape.vertices, float)
+    ways, corners = sphere_directions(4000), np.asarray(shape.vertices, float)
     with contextlib.suppress(QhullError, ValueError):  # a ball, a capsule or a plate has no faces
         ways = np.concatenate([ways, ConvexHull(corners.T).equations[:, :3]])
     reach = (ways @ corners).max(axis=1) + float(shape.radius)

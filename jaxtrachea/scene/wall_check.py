@@ -165,12 +165,12 @@ class Beyond(NamedTuple):
         )
 
 
-def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> Beyond:
+def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches) -> Beyond:
     """Gaps of balls beside the wall beyond the first and the last ring. Arguments as `measure`."""
     none = (math.nan, math.nan)
     uncertain = np.zeros(patches.centres.shape[0], bool)
     try:
-        centres, s, radius = _balls(mesh, geometry, count, beyond=True)
+        centres, s, radius = _balls(mesh, geometry, COUNT, beyond=True)
     except MeshError:  # no wall there
         return Beyond(uncertain, 0.0, (none, none))
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)

@@ -117,7 +117,7 @@ def _search(
                 if fault.kind == "ambiguous" or _names_both(header, options):
                     reason = fault
                 continue
-            if _is_labview(text):
+            if text.head[0].text.startswith("LabVIEW Measurement"):
                 header = _with_labels(header, lines[:at])
             found = columns_of_tidy(parts[0].roles, header.units)
             quoted = {role: repr(header.names[parts[0].roles[role]]) for role in found}
@@ -264,10 +264,6 @@ def _refuse_columns_of_tidy(
         f'{cure}, or set format = "machine": one curve, of which the name of the file tells '
         "specimen, trial and position",
     )
-
-
-def _is_labview(text: Text) -> bool:
-    return bool(text.head) and text.head[0].text.startswith("LabVIEW Measurement")
 
 
 def _with_labels(header: Header, above: Sequence[Line]) -> Header:
