@@ -167,9 +167,6 @@ def track(
         direction: not zero, need not be of length 1, taken without derivative; shape (3,).
         settings: `sharpness` and `warm_steps` are used.
         beta: as in `signed_distance`.
-
-    Returns:
-        The `Contact`, as `signed_distance`.
     """
     return _track(a, b, pose, direction, settings, beta)
 

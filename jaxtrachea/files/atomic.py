@@ -104,9 +104,6 @@ class _Image:
 def hdf5_file(path: Path) -> Iterator[Any]:
     """A new HDF5 file that is in its place when the block ends; nothing is if it raises.
 
-    Yields:
-        The open `h5py.File`.
-
     Raises:
         FileExistsError: there is one.
         OSError: it cannot be written.

@@ -100,9 +100,6 @@ def keep_bounds(folder: Path, now: float | None = None) -> int:
 
     Args:
         now: seconds since the epoch; None: those of the clock.
-
-    Returns:
-        How many were deleted.
     """
     now = time.time() if now is None else now
     mark = folder / LAST_LOOK

@@ -104,9 +104,6 @@ def segment(
         time: s, never falling, or None.
         first: take the first full loading instead of the last.
 
-    Returns:
-        Segments of the record.
-
     Raises:
         NoLoading: the record only unloads.
     """

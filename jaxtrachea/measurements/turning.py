@@ -121,9 +121,6 @@ def turned_back(values: Float64[np.ndarray, " n"], tolerance: float) -> Bool[np.
     Args:
         values: the record, from foot to peak.
         tolerance: largest reversal that is none.
-
-    Returns:
-        True where the tool is on its way back or up again.
     """
     back = np.zeros(values.shape, dtype=bool)
     points = turning_points(values, tolerance)

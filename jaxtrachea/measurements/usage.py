@@ -75,9 +75,6 @@ def usage(
         found: segments of the record; None: it only unloads.
         unit: of the duration of holds, ``"s"`` or ``"samples"``.
         faulty: samples left out after a break or on a flat top, and what is said of the record.
-
-    Returns:
-        Counts, segments, causes and remarks.
     """
     used = int(np.count_nonzero(keep))
     chosen = found is not None and loading in CHOOSING

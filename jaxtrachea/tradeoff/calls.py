@@ -55,9 +55,6 @@ def one_pose(arguments: Arguments) -> Call:
 
     A step of a `Session` where one takes the scene. Else `simulate` of that row in the same form:
     numbers go in and out as one array each.
-
-    Returns:
-        As `whole_path`.
     """
     scene, material, path = arguments
     row = last_row(path)

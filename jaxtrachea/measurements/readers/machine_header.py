@@ -54,9 +54,6 @@ class Found(NamedTuple):
 def find_header(text: Text, options: ReadOptions) -> tuple[Found, list[Part]]:
     """The header: the first line, by any delimiter, that names displacement and force.
 
-    Returns:
-        The header, and the trials that stand side by side below it.
-
     Raises:
         Fault: there is none, or it names a role twice.
     """

@@ -49,9 +49,6 @@ def opened(
             hold text, and as much as they like.
         limits: of a file, by the names in it.
 
-    Yields:
-        The open `h5py.File`.
-
     Raises:
         DataError: not HDF5, truncated, damaged, or refused for what it contains.
     """
