@@ -304,24 +304,8 @@ def muscle(ring: Ring, shape: Shape):
     return 2 * (jnp.pi - shape.half_angle) * ring.pitch * ring.Et_M / shape.radius
 
 
-def surface_motion(
-    q: Float[Array, " modes"], phi: Float[Array, ""], grid: Grid, shape: Shape
-) -> Float[Array, "2"]:
-    """Displacement of the outer surface at an angle on the cartilage, mm.
-
-    Args:
-        q: modes, mm.
-        phi: rad, in [-alpha, alpha].
-        grid: of this shape.
-
-    Returns:
-        Along the inward normal and along the circumference at phi.
-    """
-    return line_motion(deform(q, grid, shape), phi, grid, shape)
-
-
 def line_motion(line: Line, phi: Float[Array, ""], grid: Grid, shape: Shape) -> Float[Array, "2"]:
-    """`surface_motion` of a line that is known."""
+    """Displacement of the outer surface at phi, rad, on the cartilage: inward and round it, mm."""
     y, z = way_to(line, phi, grid, shape).motion
     normal, side = jnp.cos(phi), jnp.sin(phi)
     return jnp.stack([-y * normal - z * side, z * normal - y * side])
