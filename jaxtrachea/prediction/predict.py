@@ -8,9 +8,7 @@ from jaxtyping import ArrayLike
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.prediction.curves import CurvePrediction, predict_sources
 from jaxtrachea.prediction.pressed import pressed
-from jaxtrachea.prediction.sources import (
-    source_of,
-)
+from jaxtrachea.prediction.sources import source_of
 
 
 def predict(
