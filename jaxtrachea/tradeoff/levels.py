@@ -26,7 +26,6 @@ from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
-from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.tube import make_tube
 
@@ -172,7 +171,10 @@ def program(full: Full, levels: Levels) -> tuple[Scene, Material, Poses | Presse
     scene = dataclasses.replace(scene, plan=plan, quality=dataclasses.replace(FINE, **work))
     if levels.mesh != 1:
         assert full.made is not None
-        scene = with_mesh(scene, _mesh(scene.geometry, full.made, levels.mesh))
+        around, along, wall, relief = full.made
+        around, along = max(round(around * levels.mesh), 3), max(round(along * levels.mesh), 1)
+        mesh = make_tube(scene.geometry, around=around, along=along, wall=wall, relief=relief)
+        scene = with_mesh(scene, mesh)
     if levels.kept < rings:
         x = scene.geometry.ring_positions[kept_rings(full, levels.kept)]
         scene = with_geometry(scene, dataclasses.replace(scene.geometry, ring_positions=x))
@@ -214,12 +216,6 @@ def _load(scene: Scene, path: Poses | Presses) -> np.ndarray:
     seen = jax.jit(touch_tube)(scene, path)
     s, gap = np.asarray(seen.s), np.asarray(seen.gap)
     return s[gap < 0] if (gap < 0).any() else s
-
-
-def _mesh(geometry: Geometry, made: tuple[int, int, float, float | None], factor: float):
-    around, along, wall, relief = made
-    many = max(round(around * factor), 3), max(round(along * factor), 1)
-    return make_tube(geometry, around=many[0], along=many[1], wall=wall, relief=relief)
 
 
 def solve(scene: Scene, material: AnyMaterial, path: Poses | Presses):
