@@ -13,11 +13,13 @@ from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.names import appearance
 from jaxtrachea.measurements.read import (
+    WHOLE_FILE,
     BadCurve,
     Curve,
     DataError,
     Measurements,
     ReadOptions,
+    joined,
     read_measurements,
 )
 from jaxtrachea.measurements.readers import reader_of
@@ -113,13 +115,7 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
         raise SpecError(f"data: {error}") from None
     if len(files) == 1:
         return _without(read_measurements(files, options), spec.data.exclude)
-    parts = [_read_one(path, options) for path in files]
-    curves = [curve for part in parts for curve in part.curves]
-    bad = [curve for part in parts for curve in part.bad]
-    notes = dict.fromkeys(note for part in parts for note in part.notes)
-    _refuse_twice(parts)
-    whole = Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
-    return _without(whole, spec.data.exclude)
+    return _without(joined([_read_one(path, options) for path in files]), spec.data.exclude)
 
 
 def _name(curve: Curve | BadCurve) -> str:
@@ -162,20 +158,5 @@ def _read_one(path: Path, options: ReadOptions) -> Measurements:
         within = "" if error.place in ("", str(path)) else f"{error.place}: "
         cure = error.remedy or "repair the file or leave it out"
         problem = f"{within}{error.problem}"
-        bad = BadCurve(path.stem, "(all)", str(path), "unreadable", problem, cure)
+        bad = BadCurve(path.stem, WHOLE_FILE, str(path), "unreadable", problem, cure)
         return Measurements((), (bad,), (path,))
-
-
-def _refuse_twice(parts: list[Measurements]) -> None:
-    """Refuse a specimen and trial that two files hold."""
-    seen: dict[tuple[str, str], str] = {}
-    for part in parts:
-        for curve in (*part.curves, *(b for b in part.bad if b.trial != "(all)")):
-            key = (curve.specimen, curve.trial)
-            if key in seen:
-                raise DataError(
-                    f"specimen {key[0]!r} trial {key[1]!r} was already in {seen[key]}",
-                    place=curve.source,
-                    cure="rename one, or give a specimen pattern that tells files apart",
-                )
-            seen[key] = curve.source
