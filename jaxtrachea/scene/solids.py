@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxtrachea.contact.shapes import Shape, parts_of
+from jaxtrachea.trachea.mesh import face_vectors
 
 #: Directions on the sphere: a ball of 5 mm is drawn within 0.03 mm.
 DIRECTIONS = 600
@@ -95,8 +96,7 @@ def _triangles(shape: Shape, count: int) -> Triangles:
         hull = ConvexHull(points)
     used, faces = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], faces.reshape(hull.simplices.shape)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    inward = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
+    inward = np.sum(face_vectors(vertices, faces) * hull.equations[:, :3], axis=1) < 0
     faces[inward] = faces[inward][:, ::-1]
     return Triangles(vertices, faces)
 
