@@ -60,11 +60,7 @@ class Descent:
     learning_rate: float = 0.03
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self)
 
     @property

@@ -53,11 +53,7 @@ class Noise:
     force_by_curve: bool = False
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self)
         if isinstance(self.force_share, float) and not 0 <= self.force_share < 1:
             found = f"is {self.force_share:g}"
@@ -107,11 +103,7 @@ class Weighting:
     pressed_ends: bool = True
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self)
         if self.loss_scale <= 0:
             raise ValueError(

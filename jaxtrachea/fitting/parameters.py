@@ -62,11 +62,7 @@ class Parameter:
     foreign_value: float | None = dataclasses.field(default=None, compare=False)
 
     def __post_init__(self):
-        """Check that value, bounds and scale agree.
-
-        Raises:
-            InputError: naming the parameter and the cure.
-        """
+        """Check that value, bounds and scale agree (`InputError`)."""
         check_word(f"{self.name}: scale", self.scale, Scale)
         check_word(f"{self.name}: scope", self.scope, Scope)
         if not isinstance(self.fixed, bool):

@@ -97,11 +97,7 @@ class ObliqueOptions:
     axial: bool = True
 
     def __post_init__(self):
-        """Refuse words that mean nothing, and options of normal presses alone.
-
-        Raises:
-            ValueError: naming the option, what was found and what is expected.
-        """
+        """Refuse words that mean nothing, and options of normal presses alone (`ValueError`)."""
         check_record(self)
         _only_default(self.press)
 

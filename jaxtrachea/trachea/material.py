@@ -51,11 +51,7 @@ class Fitted:
     if_named: bool = False
 
     def __post_init__(self):
-        """Refuse words that no fit knows.
-
-        Raises:
-            ValueError: naming the field.
-        """
+        """Refuse words that no fit knows (`ValueError`)."""
         check_word("scale", self.scale, Scale)
         check_word("scope", self.scope, Scope)
 
@@ -98,11 +94,7 @@ class Declaration:
     fit: Fitted | None = None
 
     def __post_init__(self):
-        """Refuse words that have no meaning.
-
-        Raises:
-            ValueError: naming the field.
-        """
+        """Refuse words that have no meaning (`ValueError`)."""
         check_word(f"{self.name}: part", self.part, Part)
         check_word(f"{self.name}: needs", self.needs, Needs)
         check_word(f"{self.name}: each", self.varies_by, VariesBy)

@@ -67,11 +67,7 @@ class Levels:
     dtype: Literal["float32", "float64"] = "float64"
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self, sharpness=0.0, steps=1.0, mesh=0.0, kept=1.0)
 
     def changed(self, **levels: Any) -> "Levels":

@@ -214,11 +214,7 @@ class Wall:
     bed_t: float = 0.002
 
     def __post_init__(self):
-        """Refuse a wall that cannot be.
-
-        Raises:
-            InputError: naming the value.
-        """
+        """Refuse a wall that cannot be (`InputError`)."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name != "nu" and not (np.isfinite(value) and value > 0):
