@@ -20,10 +20,6 @@ def load_beside(module: str) -> None:
 
 @contextlib.contextmanager
 def beside(function: Callable, *arguments: Any) -> Iterator[Future]:
-    """A function called in a thread while the block is at work; both have ended after the block.
-
-    Args:
-        function: called once; what it raises is raised by `Future.result`.
-    """
+    """A function called in a thread while the block is at work; both have ended after the block."""
     with ThreadPoolExecutor(1, "beside") as pool:
         yield pool.submit(function, *arguments)

@@ -230,10 +230,6 @@ class Stages:
 def into(out_dir: Path | None, default: Path) -> Iterator[tuple[Path, Callable[[], None]]]:
     """Claim the output folder and watch for Ctrl-C; failures to write become `Stop`.
 
-    Args:
-        out_dir: what the user asks for.
-        default: where to write else.
-
     Yields:
         The folder to write into, and what raises KeyboardInterrupt if Ctrl-C came.
     """

@@ -32,12 +32,7 @@ _SITUATED = [
 
 
 def needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
-    """Unknowns of succeeded lanes that give cause, other than those that the structure leaves open.
-
-    Args:
-        result: of lanes fitted by themselves.
-        minima: where all starts ended.
-    """
+    """Unknowns of succeeded lanes that give cause, other than those that the structure leaves open."""
     alive = np.isin(result.status, _SITUATED)
     present = np.asarray(result.study.lanes.active > 0)
     present = present & ~result.undetermined & alive[:, None]

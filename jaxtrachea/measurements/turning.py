@@ -116,12 +116,7 @@ def loadings(values: Float64[np.ndarray, " n"], points: list[int]) -> list[tuple
 
 
 def turned_back(values: Float64[np.ndarray, " n"], tolerance: float) -> Bool[np.ndarray, " n"]:
-    """Samples of a rising record from where it turns back until it is where it was.
-
-    Args:
-        values: the record, from foot to peak.
-        tolerance: largest reversal that is none.
-    """
+    """Samples of a rising record from where it turns back until it is where it was."""
     back = np.zeros(values.shape, dtype=bool)
     points = turning_points(values, tolerance)
     if len(points) > 1 and values[points[1]] < values[points[0]]:

@@ -171,10 +171,6 @@ def mask(refused: Int[Array, ""], *arrays: Any) -> Any:
     Where products of several of these are returned, hiding the factors is enough, and cheaper:
     `where` passes no derivative, not even NaN, to what it hides.
 
-    Args:
-        refused: from `validate`.
-        arrays: arrays and trees of arrays; what is not floating stays.
-
     Returns:
         The same, one for each argument (of one argument: itself).
     """

@@ -38,11 +38,7 @@ def _place(p: CurvePrediction, i: int) -> Row:
 
 
 def prediction_rows(p: CurvePrediction, curve: Curve | None = None) -> Iterator[Row]:
-    """One row per displacement; the band is that of a new sample.
-
-    Args:
-        curve: as measured, if it was.
-    """
+    """One row per displacement; the band is that of a new sample."""
     low, high = p.low95, p.high95
     for i in range(len(p.displacement)):
         force = np.nan if curve is None else float(curve.force[i])

@@ -68,9 +68,6 @@ def tool_triangles(tool: Shape, count: int = DIRECTIONS) -> Triangles:
     Each is the hull of the support points in `count` directions and along the axes, so it lies
     inside the tool by at most 1 - cos of half the angle between directions, times the radius. A
     point, a line or a plate without a radius is drawn with `THINNEST`.
-
-    Args:
-        count: directions.
     """
     parts = [_triangles(part, count) for part in parts_of(tool)]
     shift = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
