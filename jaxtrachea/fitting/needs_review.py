@@ -32,7 +32,7 @@ _SITUATED = [
 
 
 def needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
-    """Unknowns of succeeded lanes that give cause, other than those that the structure leaves open."""
+    """Unknowns of succeeded lanes that give cause, but those that the structure leaves open."""
     alive = np.isin(result.status, _SITUATED)
     present = np.asarray(result.study.lanes.active > 0)
     present = present & ~result.undetermined & alive[:, None]
