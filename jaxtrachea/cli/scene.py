@@ -37,9 +37,9 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
 
     from jaxtrachea.files.table import words
     from jaxtrachea.files.traces import Traced
-    from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
     from jaxtrachea.scene.simulation import simulate as run
+    from jaxtrachea.tradeoff.shares import shares
 
     spec, staged = _staged(scene)
     swept = None if spec.sweep is None else _for_sweep(scene, spec, staged)[0]

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.tradeoff.calls import Arguments, Call, last_row, one_pose, whole_path
+from jaxtrachea.tradeoff.operations import count_operations
 
 #: What is made least: time of the whole path in one call (`simulate`), of a pose a call
 #: (`Session`), or operations, those in float32 counted half: the same on every machine.
