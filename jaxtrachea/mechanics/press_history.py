@@ -298,9 +298,9 @@ def _row(force, depth, load, work, status, lost, skipped, unilateral: bool):
 def _alone(law: Law, elastic):
     """Indentation of the local law under an elastic force, mm; a vector goes along it."""
     if elastic.shape[-1:] != (3,):
-        return law.root(elastic, jnp.ones_like(elastic), 0.0)
+        return law.under(elastic)
     squared = jnp.sum(elastic * elastic, axis=-1, keepdims=True)
     some = squared > 0
     size = jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1)), 0)
-    per_size = jnp.where(some, law.root(size, jnp.ones_like(size), 0.0), 0)
+    per_size = jnp.where(some, law.under(size), 0)
     return per_size / jnp.where(some, size, 1) * elastic

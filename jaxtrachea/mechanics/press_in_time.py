@@ -174,7 +174,7 @@ def _in_time(
         depth = moved - compliance * surface
         if unilateral:
             left = surface != load
-            alone = law.root(jnp.where(left, surface, 0), jnp.ones_like(surface), 0.0)
+            alone = law.under(jnp.where(left, surface, 0))
             depth = jnp.where(left, alone, depth)
     else:
         branches = relaxation.local, relaxation.skeleton

@@ -125,7 +125,7 @@ def way_of(load: Float[Array, " N"], compliance: Float[Array, ""], law: Law) -> 
     Of parts that relax alike it is the way of the tool. Where they relax apart the skeleton is
     deflected more or less than that says, and with it the shape that softens.
     """
-    return compliance * load + law.root(load, jnp.ones_like(load), 0.0)
+    return compliance * load + law.under(load)
 
 
 def _loop(local, skeleton, displacement, compliance, law: Law, unilateral: bool = True):
@@ -167,7 +167,7 @@ def one_sample(before, fading, displacement, compliance, law: Law, unilateral: b
         left = force < 0
         alone = jnp.where(left, -B / A, 0)
         force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
-        depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0.0), depth)
+        depth = jnp.where(left, law.under(alone), depth)
     load = (force - B_s) / A_s
     h = tuple(E * h + P * (new - e) for E, P, h in zip(kept, share, h, strict=True))
     q = tuple(E * q + P * (load - y) for E, P, q in zip(kept_s, share_s, q, strict=True))
@@ -257,7 +257,7 @@ def _loop_with_derivatives(
         if unilateral:
             alone = jnp.where(left, -B / A, 0)
             force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
-            depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0.0), depth)
+            depth = jnp.where(left, law.under(alone), depth)
         load, slope = (force - B_s) * per, law.tangent(depth)
         powers = [*law.powers(depth).values()]
         force, new, load, slope, left, powers = barrier((force, new, load, slope, left, powers))
