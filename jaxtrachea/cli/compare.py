@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea.cli.load import load
 from jaxtrachea.cli.options import DataOption, OutOption
-from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, say_written, table
+from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, say, say_written
 
 SpecsArgument = Annotated[
     list[Path], typer.Argument(help="Two or more fit specifications of the same curves.")
@@ -245,18 +243,16 @@ def _report(rows, sentences: dict[str, str], failed: int, models, left: str) -> 
 
 
 def _print(rows, sentences, failed: int, models, folder: Path) -> None:
-    out = Console()
     names = [name for name in sentences if name != "(all)"]
     if len(names) > MANY:  # what is decided says little more
         names.sort(key=lambda name: "decisively (" in sentences[name])
     shown = names[:MANY] + [name for name in sentences if name == "(all)"]
     for name in shown:
-        out.print(table(_table(row for row in rows if row.specimen == name)))
-        out.print(escape(f"{name}: {sentences[name]}"), highlight=False, emoji=False)
+        own = (row for row in rows if row.specimen == name)
+        say(_table(own), f"{name}: {sentences[name]}")
     if len(names) > MANY:
-        out.print(f"and {len(names) - MANY} more specimens, see compare.csv")
-    for note in _left_out_notes(models):
-        out.print(escape(note), highlight=False, emoji=False)
+        say(f"and {len(names) - MANY} more specimens, see compare.csv")
+    say(*_left_out_notes(models))
     if failed:
-        out.print(f"{failed} specimens could not be fitted by every model and count for none")
+        say(f"{failed} specimens could not be fitted by every model and count for none")
     say_written(folder)

@@ -4,12 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea import __version__
 from jaxtrachea.cli.load import print_bad, print_notes
-from jaxtrachea.cli.terminal import Stop, say_written
+from jaxtrachea.cli.terminal import Stop, say, say_written
 
 PathsArgument = Annotated[
     list[Path], typer.Argument(metavar="SOURCE... TARGET", help="Data files; the new file last.")
@@ -40,11 +38,9 @@ def convert(paths: PathsArgument, spec: SpecOption = None) -> None:
     if not curves:
         raise Stop(f"{target}: no usable curve; nothing was written")
     _write(target, measurements)
-    out = Console()
-    _print_cut(out, curves)
+    _print_cut(curves)
     samples = sum(curve.force.size for curve in curves)
-    said = f"{len(curves)} curves, {samples} samples; {len(bad)} bad curves left out"
-    out.print(said, highlight=False)
+    say(f"{len(curves)} curves, {samples} samples; {len(bad)} bad curves left out")
     say_written(target)
     raise typer.Exit(1 if bad else 0)
 
@@ -102,12 +98,11 @@ def _write(target: Path, measurements) -> None:
         raise Stop(f"{target}: cannot be written ({reason}); choose another name") from None
 
 
-def _print_cut(out: Console, curves) -> None:
+def _print_cut(curves) -> None:
     """Name the curves of which samples are left out."""
     from jaxtrachea.measurements.usage_tables import usage_lines
 
     cut = [c for c in curves if c.usage is not None and c.usage.used < c.usage.recorded]
-    for line in usage_lines(cut[:MANY]):
-        out.print(escape(line), highlight=False)
+    say(*usage_lines(cut[:MANY]))
     if len(cut) > MANY:
-        out.print(f"... and {len(cut) - MANY} more curves of which samples are left out")
+        say(f"... and {len(cut) - MANY} more curves of which samples are left out")

@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea._memory import give_back
@@ -13,9 +12,9 @@ from jaxtrachea.cli.terminal import (
     Stages,
     Stop,
     progress_bar,
+    say,
     say_lost,
     say_written,
-    table,
     to_stderr,
 )
 
@@ -132,14 +131,7 @@ def write_tables(folder: Path, findings) -> None:
 
 def show(items, folder: Path) -> None:
     """Tables and sentences of a run on the terminal, and where its files are."""
-    out = Console()
-    for item in items:
-        if isinstance(item, str):
-            out.print(escape(item), highlight=False, emoji=False)
-        else:
-            out.print(table(item))
-            if item.more:
-                out.print(escape(item.more), highlight=False, emoji=False)
+    say(*items)
     say_written(folder)
 
 

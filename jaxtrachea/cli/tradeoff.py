@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea.cli.options import OutOption
-from jaxtrachea.cli.terminal import Stop, into, progress_bar, say_written, table
+from jaxtrachea.cli.terminal import Stop, into, progress_bar, say, say_written
 
 SceneArgument = Annotated[
     Path | None, typer.Argument(help="Scene file (default: a ball on the tube of Table 1).")
@@ -124,15 +122,12 @@ def _print(rows) -> None:
     from jaxtrachea.tradeoff.load import load_warning
     from jaxtrachea.tradeoff.table import KINDS, measured_table
 
-    out = Console()
     points = [row for row in rows if "left_out" not in row]
     for kind, title in KINDS.items():
         if of_kind := [point for point in points if point["kind"] == kind]:
-            out.print(table(measured_table(of_kind, title)))
+            say(measured_table(of_kind, title))
     for row in rows:
         if "left_out" in row:
-            text = f"left out: {row['ladder']}: {row['left_out']}"
-            out.print(escape(text), highlight=False)
+            say(f"left out: {row['ladder']}: {row['left_out']}")
     loads = [point["others"] for point in points if point["others"] is not None]
-    for text in load_warning(max(loads, default=None)):
-        out.print(text, highlight=False)
+    say(*load_warning(max(loads, default=None)))

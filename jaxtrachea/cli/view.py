@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.cli.terminal import Stop, say_written, set_up_jax, to_stderr
+from jaxtrachea.cli.terminal import Stop, say, say_written, set_up_jax, to_stderr
 
 PortOption = Annotated[
     int | None, typer.Option("--port", min=1, max=65535, help="Of 127.0.0.1; none: a free one.")
@@ -38,7 +36,7 @@ def view(
         raise Stop(f"--port: {port} cannot be used ({error.strerror}); {cure}") from None
 
     def opened(address: str) -> None:
-        Console().print(f"{escape(address)}  (Ctrl-C ends it)", highlight=False, soft_wrap=True)
+        say(f"{address}  (Ctrl-C ends it)", wrap=False)
         if not no_browser and not _open(address):
             to_stderr("no browser could be opened: open the address yourself, or use --no-browser")
 
