@@ -148,11 +148,11 @@ def _print_columns(sources: Sources) -> None:
         rows = (
             {"column": c.name, "unit": c.unit or None,
              "read as": role_in_words(c.role, sources.guessed)}
-            for c in columns[:MANY]
+            for c in columns
         )  # fmt: skip
         heads = [Column("column"), Column("unit", left=True), Column("read as", left=True)]
-        rest = f"... and {len(columns) - MANY} more columns" if len(columns) > MANY else ""
-        say(Table(rows, heads, title=f"{paths[0].name}{more} ({kind})", more=rest))
+        shown = Table(rows, heads, title=f"{paths[0].name}{more} ({kind})")
+        say(shown.first(MANY, "... and {} more columns"))
     if len(groups) > TABLES:
         say(f"... and {len(groups) - TABLES} more kinds of files")
 

@@ -258,7 +258,7 @@ def _curve_table(curves):
             "markers": 0 if c.joint_displacement is None else c.joint_displacement.shape[1],
             "vectors": vector_words(c),
         }
-        for c in curves[:MANY]
+        for c in curves
     ]
     spans = [Column(name, digits=3) for name in ("D [mm]", "F [N]")]
     columns = [
@@ -266,8 +266,8 @@ def _curve_table(curves):
         Column("n"), Column("of"), *spans, Column("markers"),
         *([Column("vectors", left=True)] if several else []),
     ]  # fmt: skip
-    more = f"... and {len(curves) - MANY} more" if len(curves) > MANY else ""
-    return Table(rows, columns, title=f"{len(curves)} usable curves", more=more)
+    shown = Table(rows, columns, title=f"{len(curves)} usable curves")
+    return shown.first(MANY, "... and {} more")
 
 
 def _parameter_table(study):
