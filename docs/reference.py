@@ -130,6 +130,7 @@ TYPES = {
     "int": ("whole number", ""),
     "float": ("number", ""),
     "list[str]": ("texts", ""),
+    "Texts": ("texts", ""),
     "list[list[str]]": ("lists of texts", ""),
     "list[Direction]": ("points", ""),
     "dict[str, str]": ("table", ""),

@@ -29,7 +29,6 @@ def real(name: str, value: Any, dtype=None) -> Array:
     given: it takes the dtype of what it meets.
 
     Args:
-        name: of the argument, for the message.
         value: a number, an array (also traced) or a list of numbers.
         dtype: of numbers, lists and integer arrays; None: JAX's default.
 
@@ -79,7 +78,6 @@ def check_fits(name: str, value: Array, like: Any, cure: str, *, spread: bool = 
     """Refuse an array that a program compiled for arrays `like` this one cannot take.
 
     Args:
-        name: of the argument, for the message.
         value: from `real`.
         like: has the shape and dtype.
         cure: what else to do, for the message.

@@ -62,12 +62,7 @@ class InputError(ValueError):
 
     @classmethod
     def like(cls: type[Own], error: "InputError", **fields: Any) -> Own:
-        """The same as this kind of error.
-
-        Args:
-            error: what is wrong.
-            fields: in place of those of the error.
-        """
+        """The same as this kind of error."""
         made = cls.__new__(cls)
         made.__dict__.update(vars(error) | fields)
         made.args = (str(made),)

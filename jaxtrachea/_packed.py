@@ -20,7 +20,6 @@ class Part(NamedTuple):
 
     Attributes:
         numbers: its place, as a slice.
-        shape: -
         dtype: None: that of the one array.
     """
 

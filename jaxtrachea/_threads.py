@@ -8,11 +8,7 @@ from typing import Any
 
 
 def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """`functools.lru_cache` for threads: while one makes a value, the others wait for it.
-
-    Args:
-        maxsize: values kept.
-    """
+    """`functools.lru_cache` for threads: while one makes a value, the others wait for it."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         cached, making = functools.lru_cache(maxsize)(function), threading.Lock()

@@ -101,6 +101,8 @@ ShareNoise = Annotated[
 LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, words=("estimate",))]
 Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
 NumberOrTrue = Annotated[Any, BeforeValidator(_value_or_true)]
+#: One text stands for a list of it.
+Texts = Annotated[list[str], BeforeValidator(lambda v: [v] if isinstance(v, str) else v)]
 
 
 class Section(BaseModel):
@@ -112,7 +114,7 @@ class Section(BaseModel):
 class DataSection(Section):
     """[data]: which files, and how to read them (docs/measurements.md)."""
 
-    files: list[str] = Field(min_length=1)
+    files: Texts = Field(min_length=1)
     """a path or pattern, or a list of them, from the specification's folder or `--data`"""
     format: str = "auto"
     """`tidy`, `machine`, `hdf5`, `afmformats`, or `auto`: by content"""
@@ -164,13 +166,6 @@ class DataSection(Section):
     """line of the force before first touch. `auto`: fitted where a record shows one. `slope`: of
     every curve, and a curve without 5 samples there is left out. `none`: of no curve
     """
-
-    @model_validator(mode="before")
-    @classmethod
-    def _one_file(cls, data: Any) -> Any:
-        if isinstance(data, dict) and isinstance(data.get("files"), str):
-            return {**data, "files": [data["files"]]}
-        return data
 
     @model_validator(mode="after")
     def _told(self) -> "DataSection":
@@ -405,7 +400,7 @@ class FitSection(Section):
 class UncertaintySection(Section):
     """[uncertainty]: what is done beyond the local standard errors (docs/read_a_fit.md)."""
 
-    profile: list[str] = []
+    profile: Texts = []
     """parameters to profile; `"all"`: every fitted one"""
     profile_points: int = Field(10, ge=2, le=1000)
     """points on each side of the estimate"""
@@ -421,13 +416,6 @@ class UncertaintySection(Section):
     """draws of each chain (NUTS), 100 or more; 0: none"""
     posterior_chains: int = Field(4, ge=2, le=1000)
     """chains of each fit"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _one_name(cls, data: Any) -> Any:
-        if isinstance(data, dict) and isinstance(data.get("profile"), str):
-            return {**data, "profile": [data["profile"]]}
-        return data
 
     @model_validator(mode="after")
     def _enough(self) -> "UncertaintySection":

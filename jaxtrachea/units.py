@@ -250,9 +250,6 @@ def parse_quantity(text: str | float | int, dimension: str) -> float:
         text: number and unit. A bare number is refused unless `dimension` is "dimensionless".
         dimension: the dimension it must have, one of `DIMENSIONS`.
 
-    Returns:
-        The value in internal units.
-
     Raises:
         UnitError: no unit, an unknown one, one of another dimension, or no finite number.
     """
@@ -284,12 +281,6 @@ def column_unit(header: str) -> tuple[str, str | None]:
     ``force [N]``, ``force (N)``, ``force / N``, ``force, N`` and ``force_N`` all give
     ``("force", "N")``. What stands in brackets is taken for a unit whether or not it is a known
     one, so that a slip is reported as such; after ``_``, ``/`` or a comma only a known unit counts.
-
-    Args:
-        header: the header cell.
-
-    Returns:
-        Name and unit; the unit is None if the header has none.
     """
     text = header.strip()
     if len(text) > MAX_TEXT:

@@ -45,7 +45,7 @@ STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}
 #: Modules within the larger rooms, from the bottom up.
 WITHIN = {
     "scene": [
-        {"operations", "curve", "sizes", "declare", "needs"},
+        {"curve", "sizes", "declare", "needs"},
         {"wall_check"},
         {"depth", "width"},
         {"wall", "effects"},
@@ -68,7 +68,7 @@ WITHIN = {
         {"step"},
         {"session"},
         {"build", "results"},
-        {"cost", "plots", "read", "solids"},
+        {"plots", "read", "solids"},
         {"surface_plot", "recording"},
         {"gltf", "vtk_files"},
     ],
@@ -143,8 +143,8 @@ WITHIN = {
                    {"plots", "tables"}, {"report"}],
     "runs": [{"manifest"}, {"shards"}, {"folder"}, {"rerun", "checkpoint"}, {"cluster"}],
     "tradeoff": [
-        {"calls", "errors", "levels", "load", "table"},
-        {"ladders", "parts", "cost"},
+        {"calls", "errors", "levels", "load", "operations", "table"},
+        {"ladders", "parts", "cost", "shares"},
         {"timing", "trial"},
         {"choice"},
         {"measure"},

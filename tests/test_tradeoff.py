@@ -12,7 +12,7 @@ import pytest
 from matplotlib.text import Text
 from run_cli import run
 from tradeoff_front import pareto
-from tradeoff_page import choice_rows, fronts
+from tradeoff_page import choice_row, choice_rows, fronts
 from tradeoff_plots import QUESTIONS, draw
 from tradeoff_scene import DEPTH, K_1, K_3, SCENE, TOML
 
@@ -315,7 +315,7 @@ def test_a_choice_can_be_shown():
     choice = choose(full, 0.1, precision="float64")
     repeat = Cost(1e-5, 0.9, 0.87, 0.94)
     end = measuring.environment(measuring.Settings(), Load())
-    row = measuring.choice_row("small", choice, repeat, end)
+    row = choice_row("small", choice, repeat, end)
     recorded = json.loads(json.dumps(row))
     ((*_, error, cost, operations, time, calls, share, alike),) = choice_rows([recorded])
     assert (time, calls) == ("90 % (87 to 94)", "9 / 10")

@@ -12,7 +12,6 @@ from scipy.stats import binom
 from tradeoff_scene import SCENE, TOML
 
 from jaxtrachea.scene.build import stage
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.tradeoff import calls as calling
@@ -25,6 +24,7 @@ from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import Ladder
 from jaxtrachea.tradeoff.levels import BUILT_IN, cast, full_scene, program
 from jaxtrachea.tradeoff.load import QUIET, Load, load_warning
+from jaxtrachea.tradeoff.operations import count_operations
 from jaxtrachea.tradeoff.trial import Trial
 
 

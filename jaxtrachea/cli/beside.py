@@ -9,11 +9,7 @@ from typing import Any
 
 
 def load_beside(module: str) -> None:
-    """Import a module in a thread; what is wrong with it is said where it is used.
-
-    Args:
-        module: full name.
-    """
+    """Import a module in a thread; what is wrong with it is said where it is used."""
 
     def load() -> None:
         with contextlib.suppress(Exception):
@@ -24,11 +20,6 @@ def load_beside(module: str) -> None:
 
 @contextlib.contextmanager
 def beside(function: Callable, *arguments: Any) -> Iterator[Future]:
-    """A function called in a thread while the block is at work; both have ended after the block.
-
-    Args:
-        function: called once; what it raises is raised by `Future.result`.
-        arguments: of the function.
-    """
+    """A function called in a thread while the block is at work; both have ended after the block."""
     with ThreadPoolExecutor(1, "beside") as pool:
         yield pool.submit(function, *arguments)

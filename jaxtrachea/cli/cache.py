@@ -3,9 +3,8 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from jaxtrachea.cli.terminal import Stop, cache_folder, programs_folder
+from jaxtrachea.cli.terminal import Stop, cache_folder, programs_folder, say
 from jaxtrachea.files.programs import (
     MOST_BYTES,
     MOST_DAYS,
@@ -40,7 +39,7 @@ def cache(clear: ClearOption = False) -> None:
             text += f"\nat most {MOST_BYTES // 2**20} MiB, and none unused for {MOST_DAYS:g} days"
             uses = last_uses(folder)
             text += "" if uses is None else f"\n{_last_run(uses)}"
-    Console().print(text, markup=False, highlight=False, soft_wrap=True)
+    say(text, wrap=False)
 
 
 def _last_run(uses: Uses) -> str:

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea.cli.load import load
 from jaxtrachea.cli.options import DataOption, OutOption
-from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, table
+from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, say, say_written
 
 SpecsArgument = Annotated[
     list[Path], typer.Argument(help="Two or more fit specifications of the same curves.")
@@ -49,6 +47,8 @@ def compare(
     leave_out: LeaveOutOption = _LeaveOut.positions,
 ) -> None:
     """Fit the same curves by several models and rank these."""
+    from jaxtrachea.inference.repeats import repeats
+
     clock = [time.perf_counter()]
     if len(specs) < 2:
         raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")
@@ -63,7 +63,7 @@ def compare(
     with into(out_dir, default) as (folder, stop_if_asked):
         models = _fitted(loaded, names, left, stop_if_asked)
         clock.append(time.perf_counter())
-        words = _left_out_words(models, leave_out.value)
+        words = repeats(models[0].result.study, leave_out.value).words or "curves"
         rows, failed, sentences = _write(folder, specs, loaded, models, clock, words)
     _print(rows, sentences, failed, models, folder.parent)
     raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
@@ -136,30 +136,25 @@ def _fitted(loaded, names, leave_out, stop_if_asked) -> list:
 
 def _write(folder: Path, specs, loaded, models, clock, left: str):
     """compare.csv, report.md, provenance.json; returns the rows, failed lanes and sentences."""
-    import json
     from hashlib import sha256 as digest
 
-    import jax
-
     from jaxtrachea.files.atomic import write_text
-    from jaxtrachea.files.provenance import provenance
+    from jaxtrachea.files.provenance import provenance, write_provenance
     from jaxtrachea.inference.comparison import compared
 
     rows, failed = compared(models)
     sentences = _sentences(rows, left)
     _table(rows).write_csv(folder / "compare.csv")
     write_text(folder / "report.md", _report(rows, sentences, failed, models, left))
-    ends = [*clock, time.perf_counter()]
-    timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
+    phases, ends = ("read", "fit", "write"), [*clock, time.perf_counter()]
     measured, precision = loaded[0][1], loaded[0][0].fit.precision
-    device = str(jax.devices()[0])
-    made = provenance(specs[0], measured.sha256(), device, precision, timings)
+    made = provenance(specs[0], measured.sha256(), precision, phases, ends)
     made["specifications"] = [
         {"file": path.name, "model": m.name, "sha256": digest(path.read_bytes()).hexdigest()}
         for path, m in zip(specs, models, strict=True)
     ]
     del made["specification"]
-    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    write_provenance(folder, made)
     return rows, failed, sentences
 
 
@@ -172,13 +167,6 @@ def _sentences(rows, left: str) -> dict[str, str]:
         own = [row for row in rows if row.specimen == specimen]
         sentences[specimen] = sentence(own, left)
     return sentences
-
-
-def _left_out_words(models, leave_out) -> str:
-    """What was left out, in words; "curves" if nothing was."""
-    from jaxtrachea.inference.repeats import repeats
-
-    return repeats(models[0].result.study, leave_out).words or "curves"
 
 
 def _left_out_notes(models) -> list[str]:
@@ -255,18 +243,16 @@ def _report(rows, sentences: dict[str, str], failed: int, models, left: str) -> 
 
 
 def _print(rows, sentences, failed: int, models, folder: Path) -> None:
-    out = Console()
     names = [name for name in sentences if name != "(all)"]
     if len(names) > MANY:  # what is decided says little more
         names.sort(key=lambda name: "decisively (" in sentences[name])
     shown = names[:MANY] + [name for name in sentences if name == "(all)"]
     for name in shown:
-        out.print(table(_table(row for row in rows if row.specimen == name)))
-        out.print(escape(f"{name}: {sentences[name]}"), highlight=False, emoji=False)
+        own = (row for row in rows if row.specimen == name)
+        say(_table(own), f"{name}: {sentences[name]}")
     if len(names) > MANY:
-        out.print(f"and {len(names) - MANY} more specimens, see compare.csv")
-    for note in _left_out_notes(models):
-        out.print(escape(note), highlight=False, emoji=False)
+        say(f"and {len(names) - MANY} more specimens, see compare.csv")
+    say(*_left_out_notes(models))
     if failed:
-        out.print(f"{failed} specimens could not be fitted by every model and count for none")
-    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
+        say(f"{failed} specimens could not be fitted by every model and count for none")
+    say_written(folder)

@@ -4,12 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea import __version__
 from jaxtrachea.cli.load import print_bad, print_notes
-from jaxtrachea.cli.terminal import Stop
+from jaxtrachea.cli.terminal import Stop, say, say_written
 
 PathsArgument = Annotated[
     list[Path], typer.Argument(metavar="SOURCE... TARGET", help="Data files; the new file last.")
@@ -40,12 +38,10 @@ def convert(paths: PathsArgument, spec: SpecOption = None) -> None:
     if not curves:
         raise Stop(f"{target}: no usable curve; nothing was written")
     _write(target, measurements)
-    out = Console()
-    _print_cut(out, curves)
+    _print_cut(curves)
     samples = sum(curve.force.size for curve in curves)
-    said = f"{len(curves)} curves, {samples} samples; {len(bad)} bad curves left out"
-    out.print(said, highlight=False)
-    out.print(f"written to {target}", markup=False, highlight=False, soft_wrap=True)
+    say(f"{len(curves)} curves, {samples} samples; {len(bad)} bad curves left out")
+    say_written(target)
     raise typer.Exit(1 if bad else 0)
 
 
@@ -60,11 +56,7 @@ def _check_target(target: Path) -> None:
 
 
 def _read(sources: list[Path], path: Path | None):
-    """The curves of the files.
-
-    Raises:
-        Stop: a file, the specification or its options cannot be used.
-    """
+    """The curves of the files."""
     from jaxtrachea.config import DataSection, FitSpec, SpecError, load_fit_spec
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError
@@ -87,11 +79,7 @@ def _read(sources: list[Path], path: Path | None):
 
 
 def _write(target: Path, measurements) -> None:
-    """Write the usable curves.
-
-    Raises:
-        Stop: the format cannot hold them, or the file cannot be written.
-    """
+    """Write the usable curves."""
     from jaxtrachea._errors import InputError
     from jaxtrachea.measurements.read import write_hdf5
     from jaxtrachea.measurements.tidy_writer import write_tidy
@@ -110,12 +98,11 @@ def _write(target: Path, measurements) -> None:
         raise Stop(f"{target}: cannot be written ({reason}); choose another name") from None
 
 
-def _print_cut(out: Console, curves) -> None:
+def _print_cut(curves) -> None:
     """Name the curves of which samples are left out."""
     from jaxtrachea.measurements.usage_tables import usage_lines
 
     cut = [c for c in curves if c.usage is not None and c.usage.used < c.usage.recorded]
-    for line in usage_lines(cut[:MANY]):
-        out.print(escape(line), highlight=False)
+    say(*usage_lines(cut[:MANY]))
     if len(cut) > MANY:
-        out.print(f"... and {len(cut) - MANY} more curves of which samples are left out")
+        say(f"... and {len(cut) - MANY} more curves of which samples are left out")

@@ -98,11 +98,7 @@ class InitOptions(FileOptions):
 
 
 def _pairs(option: str, texts: list[str], example: str) -> dict[str, str]:
-    """Role to what stands behind its sign of equality.
-
-    Raises:
-        Stop: one has none, or a role comes twice with another value.
-    """
+    """Role to what stands behind its sign of equality."""
     pairs: dict[str, str] = {}
     for text in texts:
         role, sign, value = text.partition("=")

@@ -181,15 +181,7 @@ def _finished(options: FitOptions, target: Path, now, study):
 
 @contextlib.contextmanager
 def running(options: FitOptions, now, study, settings, devices: list) -> Iterator[Run]:
-    """The run, opened, and put into place at the end; or what is kept is said.
-
-    Args:
-        options: of the command.
-        now: manifest of what would be run now.
-        study: the study.
-        settings: of the solver.
-        devices: as `worker_devices` gives them.
-    """
+    """The run, opened, and put into place at the end; or what is kept is said."""
     from jaxtrachea.runs import checkpoint, cluster, manifest
     from jaxtrachea.runs import folder as run_folder
 

@@ -7,14 +7,13 @@ import tomllib
 from pathlib import Path
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli.file_options import CheckOptions, InitOptions
 from jaxtrachea.cli.load import print_bad, print_notes
 from jaxtrachea.cli.options import with_fields
 from jaxtrachea.cli.sources import Sources, read_sources
-from jaxtrachea.cli.terminal import Stop, set_up_jax, table, to_stderr
+from jaxtrachea.cli.terminal import Stop, say, set_up_jax, to_stderr
 from jaxtrachea.cli.written_spec import specification_text, summary
 from jaxtrachea.measurements.observed import OBSERVED
 
@@ -46,23 +45,22 @@ def init(options: InitOptions) -> None:
     blocked = missing(sources)
     text = specification_text(sources, options.out, blocked)
     _write(options, text)
-    out = Console()
-    out.print(summary(sources.measurements.curves), highlight=False)
+    say(summary(sources.measurements.curves))
     print_missing(blocked, f"write it into {options.out}")
     written = f"written to {options.out}; {'complete it, then' if blocked else 'next'}: "
     written += f"jaxtrachea fit {shlex.quote(str(options.out))}"
-    out.print(written, markup=False, highlight=False, soft_wrap=True)
+    say(written, wrap=False)
     raise typer.Exit(1 if blocked or sources.measurements.bad else 0)
 
 
-def read_and_show(options: CheckOptions, out: Console) -> Sources:
+def read_and_show(options: CheckOptions) -> Sources:
     """Read data files and show what their columns seem to be; `check` shows the curves."""
     sources = _read(options)
-    _print_columns(sources, out)
+    _print_columns(sources)
     return sources
 
 
-def conclude(options: CheckOptions, sources: Sources, out: Console) -> None:
+def conclude(options: CheckOptions, sources: Sources) -> None:
     """What is missing to fit data files, and the command that writes a specification.
 
     Raises:
@@ -71,13 +69,12 @@ def conclude(options: CheckOptions, sources: Sources, out: Console) -> None:
     blocked = missing(sources)
     print_missing(blocked, "write it into the specification that init writes")
     if not blocked:
-        out.print("Nothing is missing to fit these curves on the tube of Table 1.")
+        say("Nothing is missing to fit these curves on the tube of Table 1.")
     command = f"jaxtrachea init {shlex.join(map(str, options.paths))}{options.words}"
     if "data" in blocked and options.s is None:
         named = all(_IN_NAME.search(path.stem) for path in sources.files)
         command += f" {OF_NAMES}" if named and not options.specimen else " --s '40 mm'"
-    out.print("To write a specification:", highlight=False)
-    out.print(f"    {command}", markup=False, highlight=False, soft_wrap=True)
+    say("To write a specification:", f"    {command}", wrap=False)
     raise typer.Exit(1 if blocked or sources.measurements.bad else 0)
 
 
@@ -138,7 +135,7 @@ def _read(options: CheckOptions | InitOptions) -> Sources:
     return sources
 
 
-def _print_columns(sources: Sources, out: Console) -> None:
+def _print_columns(sources: Sources) -> None:
     """The columns of the files, those with the same columns together."""
     from jaxtrachea.files.table import Column, Table
 
@@ -151,14 +148,13 @@ def _print_columns(sources: Sources, out: Console) -> None:
         rows = (
             {"column": c.name, "unit": c.unit or None,
              "read as": role_in_words(c.role, sources.guessed)}
-            for c in columns[:MANY]
+            for c in columns
         )  # fmt: skip
         heads = [Column("column"), Column("unit", left=True), Column("read as", left=True)]
-        out.print(table(Table(rows, heads, title=f"{paths[0].name}{more} ({kind})")))
-        if len(columns) > MANY:
-            out.print(f"... and {len(columns) - MANY} more columns")
+        shown = Table(rows, heads, title=f"{paths[0].name}{more} ({kind})")
+        say(shown.first(MANY, "... and {} more columns"))
     if len(groups) > TABLES:
-        out.print(f"... and {len(groups) - TABLES} more kinds of files")
+        say(f"... and {len(groups) - TABLES} more kinds of files")
 
 
 def role_in_words(role: str, guessed: frozenset[str]) -> str:
@@ -185,11 +181,7 @@ def _check_target(options: InitOptions) -> None:
 
 
 def _write(options: InitOptions, text: str) -> None:
-    """Write the specification, whole or not at all.
-
-    Raises:
-        Stop: it cannot be written.
-    """
+    """Write the specification, whole or not at all."""
     from jaxtrachea.config import FitSpec
     from jaxtrachea.files.atomic import write_whole
 

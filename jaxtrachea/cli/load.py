@@ -15,7 +15,6 @@ def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[st
     """Specification, measurements and study; what is wrong with curves goes to stderr.
 
     Args:
-        path: the specification.
         data: folder its paths start from; None: its own.
         refits: single curves will be left out, or unknowns held (see `specification.study_of`).
         printed: lines that were printed before (of another model of the same curves) and are not

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea import __version__
@@ -42,8 +41,8 @@ from jaxtrachea.cli.terminal import (
     complain,
     into,
     quiet_compiler,
+    say,
     say_lost,
-    table,
     to_stderr,
 )
 
@@ -118,13 +117,11 @@ def _options(
 def demo(folder: cli_demo.FolderArgument = Path("jaxtrachea-demo")) -> None:
     """Write an example into a new folder and fit its curves."""
     cli_demo.write_example(folder)
-    out = Console()
-    out.print(f"{folder}: curves of a finite-element trachea, a fit of them, a scene", markup=False)
+    say(f"{folder}: curves of a finite-element trachea, a fit of them, a scene")
     try:
         fit(spec=folder / "fit.toml", out_dir=folder / "fit")
     except typer.Exit:
-        for line in cli_demo.next_steps(folder):
-            out.print(line, markup=False, highlight=False, soft_wrap=True)
+        say(*cli_demo.next_steps(folder), wrap=False)
         raise
 
 
@@ -136,24 +133,22 @@ def check(options: CheckOptions) -> None:
     from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.understood import understood
 
-    out = Console()
     if (spec := specification_in(options)) is None:
-        sources = cli_init.read_and_show(options, out)
-        _print_curves(out, sources.measurements.curves)
-        cli_init.conclude(options, sources, out)
+        sources = cli_init.read_and_show(options)
+        _print_curves(sources.measurements.curves)
+        cli_init.conclude(options, sources)
         return
     loaded, measurements, study = load(spec, options.data)
     refuse(spec, Request(loaded, study, settings_of(loaded)))
-    _print_curves(out, measurements.curves, study.weighs_noise)
-    for line in understood(loaded, study):
-        out.print(escape(line), highlight=False)
+    _print_curves(measurements.curves, study.weighs_noise)
+    say(*understood(loaded, study))
     if study.free:
-        out.print(_parameter_table(study))
+        say(_parameter_table(study))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in study.parameters if p.fixed)
-    out.print(f"Fixed: {fixed or 'none'}", highlight=False)
+    say(f"Fixed: {fixed or 'none'}")
     lanes, bad = len(study.curves), len(measurements.bad)
     joint = ", fitted jointly" if study.joint else ""
-    out.print(f"{lanes} fit(s){joint} of up to {study.size} unknowns, {bad} bad curves")
+    say(f"{lanes} fit(s){joint} of up to {study.size} unknowns, {bad} bad curves")
     raise typer.Exit(1 if bad else 0)
 
 
@@ -225,26 +220,23 @@ for _command in (
     app.command()(_command)
 
 
-def _print_curves(out: Console, curves, weighed: bool = False) -> None:
+def _print_curves(curves, weighed: bool = False) -> None:
     """The first curves, one a row, and what is used of them."""
-    out.print(_curve_table(curves))
-    if len(curves) > MANY:
-        out.print(f"... and {len(curves) - MANY} more")
-    _print_usage(out, curves, weighed)
+    say(_curve_table(curves))
+    _print_usage(curves, weighed)
 
 
-def _print_usage(out: Console, curves, weighed: bool) -> None:
+def _print_usage(curves, weighed: bool) -> None:
     """What is used of the curves that are not used whole, and what is doubtful about them."""
     from jaxtrachea.measurements.usage_tables import sentences, usage_lines
     from jaxtrachea.trials.repeats import trial_sentences
 
     told = [c for c in curves if usage_lines([c])]
-    for line in usage_lines(told[:MANY]):
-        out.print(escape(line), highlight=False)
+    say(*usage_lines(told[:MANY]))
     if len(told) > MANY:
-        out.print(f"... and {len(told) - MANY} more curves not used whole; a fit lists all")
+        say(f"... and {len(told) - MANY} more curves not used whole; a fit lists all")
     for sentence in [*sentences(curves), *trial_sentences(curves, weighed=weighed)]:
-        out.print(escape(f"{sentence[:1].upper()}{sentence[1:]}."), highlight=False)
+        say(f"{sentence[:1].upper()}{sentence[1:]}.")
 
 
 def _curve_table(curves):
@@ -266,7 +258,7 @@ def _curve_table(curves):
             "markers": 0 if c.joint_displacement is None else c.joint_displacement.shape[1],
             "vectors": vector_words(c),
         }
-        for c in curves[:MANY]
+        for c in curves
     ]
     spans = [Column(name, digits=3) for name in ("D [mm]", "F [N]")]
     columns = [
@@ -274,7 +266,8 @@ def _curve_table(curves):
         Column("n"), Column("of"), *spans, Column("markers"),
         *([Column("vectors", left=True)] if several else []),
     ]  # fmt: skip
-    return table(Table(rows, columns, title=f"{len(curves)} usable curves"))
+    shown = Table(rows, columns, title=f"{len(curves)} usable curves")
+    return shown.first(MANY, "... and {} more")
 
 
 def _parameter_table(study):
@@ -291,4 +284,4 @@ def _parameter_table(study):
          f"{p.scope}, {own[:, :, j].sum()} of {curves}" if p.auto else p.scope]
         for j, p in enumerate(study.parameters) if not p.fixed
     ]  # fmt: skip
-    return table(words("Free parameters", head, rows))
+    return words("Free parameters", head, rows)

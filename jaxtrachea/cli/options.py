@@ -83,11 +83,7 @@ class FitOptions:
 
 
 def with_fields(kind: type) -> Callable[[Callable[[Any], None]], Callable[..., None]]:
-    """A command of one record becomes one whose options are the record's fields.
-
-    Args:
-        kind: dataclass whose fields are annotated as typer's parameters are.
-    """
+    """A command of one record becomes one whose options are the record's fields."""
 
     def decorate(command):
         def with_options(**options) -> None:

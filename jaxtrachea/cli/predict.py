@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli.load import print_bad
 from jaxtrachea.cli.predict_data import measured_curves
-from jaxtrachea.cli.terminal import Stop, into, say_lost, set_up_jax, table, to_stderr
+from jaxtrachea.cli.terminal import Stop, into, say, say_lost, say_written, set_up_jax, to_stderr
 
 ResultsArgument = Annotated[
     Path, typer.Argument(help="Folder of a finished fit, or its results.h5.")
@@ -220,16 +219,11 @@ def _markers(compared, rings: int):
 
 
 def _show(title: str, shown) -> None:
-    out = Console()
     shown.title = title
     if shown:
-        out.print(table(shown))
-    if shown.more:
-        out.print(shown.more)
+        say(shown)
 
 
 def _end(lines: Sequence[str], folder: Path) -> None:
-    out = Console()
-    for line in lines:
-        out.print(escape(line), highlight=False)
-    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
+    say(*lines)
+    say_written(folder)

@@ -10,10 +10,6 @@ from jaxtrachea.cli.terminal import Stop
 def measured_curves(stored, given: Sequence[str]):
     """The measurements of --data, and what is to be said of how they were read.
 
-    Args:
-        stored: the fit.
-        given: one specification, or files.
-
     Raises:
         Stop: they cannot be read, or are of another tube or model.
     """

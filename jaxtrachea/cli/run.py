@@ -4,12 +4,19 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea._memory import give_back
 from jaxtrachea.cli.beside import beside, load_beside
-from jaxtrachea.cli.terminal import Stages, Stop, progress_bar, say_lost, table, to_stderr
+from jaxtrachea.cli.terminal import (
+    Stages,
+    Stop,
+    progress_bar,
+    say,
+    say_lost,
+    say_written,
+    to_stderr,
+)
 
 
 def refuse(path: Path, request) -> None:
@@ -50,15 +57,12 @@ def run(request, stop_if_asked, fit=None):
 
 def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manifest) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
-    import json
     import shlex
-
-    import jax
 
     from jaxtrachea.files.atomic import write_text
     from jaxtrachea.files.html import page
     from jaxtrachea.files.pictures import with_ending, without_lost
-    from jaxtrachea.files.provenance import provenance
+    from jaxtrachea.files.provenance import provenance, write_provenance
     from jaxtrachea.files.table import Table
     from jaxtrachea.measurements.usage_tables import usage_section
     from jaxtrachea.report.fit import report_text
@@ -87,14 +91,11 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     say_lost(lost)
     text = without_lost(with_ending(text, ending), lost)
     write_text(folder / "report.md", text)
-    ends = [*clock, time.perf_counter()]
-    phases = ("read", "fit", "write")
-    timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
-    made = provenance(
-        spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
-    ) | {"excluded": loaded.data.exclude, "run": manifest}
+    phases, ends = ("read", "fit", "write"), [*clock, time.perf_counter()]
+    made = provenance(spec, measurements.sha256(), loaded.fit.precision, phases, ends)
+    made |= {"excluded": loaded.data.exclude, "run": manifest}
     write_hdf5(folder / "results.h5", findings, made, loaded.data.model_dump(mode="json"))
-    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    write_provenance(folder, made)
     pictures = {path.name: path.read_bytes() for path in drawn}
     names = {path.name for path in folder.iterdir()}
     influence, section = findings.get("influence"), ""
@@ -130,15 +131,8 @@ def write_tables(folder: Path, findings) -> None:
 
 def show(items, folder: Path) -> None:
     """Tables and sentences of a run on the terminal, and where its files are."""
-    out = Console()
-    for item in items:
-        if isinstance(item, str):
-            out.print(escape(item), highlight=False, emoji=False)
-        else:
-            out.print(table(item))
-            if item.more:
-                out.print(escape(item.more), highlight=False, emoji=False)
-    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
+    say(*items)
+    say_written(folder)
 
 
 def poor(findings) -> bool:

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea.cli.beside import beside, load_beside
 from jaxtrachea.cli.options import OutOption
@@ -17,9 +15,10 @@ from jaxtrachea.cli.terminal import (
     interrupts,
     into,
     progress_bar,
+    say,
     say_lost,
+    say_written,
     set_up_jax,
-    table,
 )
 
 SceneArgument = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
@@ -36,14 +35,13 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
 
     from jaxtrachea.files.table import words
     from jaxtrachea.files.traces import Traced
-    from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
     from jaxtrachea.scene.simulation import simulate as run
+    from jaxtrachea.tradeoff.shares import shares
 
     spec, staged = _staged(scene)
     swept = None if spec.sweep is None else _for_sweep(scene, spec, staged)[0]
     staged, choice = _chosen(scene, spec, staged)
-    out = Console()
     head = ["effect", "level", "chosen", "operations", "reason"]
     with ThreadPoolExecutor(1) as beside:
         # The program that `simulate` will load is compiled while the operations are counted.
@@ -51,25 +49,25 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
         with progress_bar(transient=True) as bar:
             bar.add_task("counting operations", total=None)
             whole, found = shares(staged)
-        out.print(table(words("Plan", head, plan_rows(staged.scene.plan, found), ("reason",))))
-        out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
+        say(words("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
+        say(f"{whole:,} operations for {_rows(staged)} rows")
         with progress_bar(transient=True) as bar:
             bar.add_task("compiling for simulate", total=None)
             kept.result()
     if timed:
-        out.print(escape(_timed(staged)), highlight=False)
+        say(_timed(staged))
     if choice is not None:
-        out.print(escape(choice.sentence), highlight=False)
+        say(choice.sentence)
     if swept is not None:
-        out.print(escape(_levels_of(swept)), highlight=False)
-    for note in staged.notes:
-        out.print(escape(note), highlight=False)
+        say(_levels_of(swept))
+    say(*staged.notes)
 
 
 def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     """Move the tool along its path: forces, deformed mesh, pictures."""
     import jax
 
+    from jaxtrachea.files.provenance import write_provenance
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.results import (
         last_solved,
@@ -112,18 +110,17 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 lost = _write_play(folder, title) if spec.output.play else {}
                 if spec.output.vtk or spec.output.animation:
                     _write_recording(folder, spec.output)
-                _write_json(folder, made)
+                write_provenance(folder, made)
                 lost |= drawing.result()
         say_lost(lost)
     _print_rows(out, staged.scene.names)
     failed = _print_failures(out.status, "row(s)")
-    for note in staged.notes:
-        Console().print(escape(note), highlight=False)
+    say(*staged.notes)
     if choice is not None:
-        Console().print(escape(choice.sentence), highlight=False)
+        say(choice.sentence)
     if last_solved(out) is None:
-        Console().print("no row was solved: no mesh, no picture of the surface")
-    Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+        say("no row was solved: no mesh, no picture of the surface")
+    say_written(folder.parent)
     raise typer.Exit(1 if failed else 0)
 
 
@@ -133,6 +130,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import numpy as np
 
     from jaxtrachea.files.pictures import save_each
+    from jaxtrachea.files.provenance import write_provenance
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.plots import draw_sweep
     from jaxtrachea.scene.results import write_sweep
@@ -170,16 +168,15 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
         if spec.output.vtk and (mesh := staged.scene.mesh) is not None:
             write_map(folder / "sweep.vtp", mesh, s, phi, out)
-        _write_json(folder, made)
+        write_provenance(folder, made)
     unsolved = int(np.isnan(np.asarray(out.force)).sum())
-    console = Console()
-    console.print(escape(_levels_of(swept)), highlight=False)
-    console.print(
+    say(
+        _levels_of(swept),
         f"{total} contact points, {unsolved} without a solution, "
-        f"{clock[2] - clock[1]:.2f} s with compilation", highlight=False,
-    )  # fmt: skip
+        f"{clock[2] - clock[1]:.2f} s with compilation",
+    )
     failed = _print_failures(out.status, "point(s)")
-    console.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    say_written(folder.parent)
     raise typer.Exit(1 if failed else 0)
 
 
@@ -361,17 +358,8 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
     from jaxtrachea.files.provenance import provenance
 
     inputs = {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in staged.files}
-    seconds = {name: clock[i + 1] - clock[i] for i, name in enumerate(("read", "compute"))}
     dtype = str(jax.tree.leaves(staged.material)[0].dtype)
-    return provenance(scene, inputs, str(jax.devices()[0]), dtype, seconds)
-
-
-def _write_json(folder: Path, made: dict) -> None:
-    import json
-
-    from jaxtrachea.files.atomic import write_text
-
-    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    return provenance(scene, inputs, dtype, ("read", "compute"), clock)
 
 
 def _print_failures(status, what: str) -> int:
@@ -383,7 +371,7 @@ def _print_failures(status, what: str) -> int:
     failed = np.asarray(status)
     failed = failed[failed > PressStatus.NO_CONTACT]
     for code, count in zip(*np.unique(failed, return_counts=True), strict=True):
-        Console().print(f"{count} {what}: {PressStatus(int(code)).message}", highlight=False)
+        say(f"{count} {what}: {PressStatus(int(code)).message}")
     return int(np.sum(failed != PressStatus.LIFTED))
 
 
@@ -433,4 +421,4 @@ def _print_rows(out, names) -> None:
         title = f"{len(pick)} of {count} rows; all are in simulation.h5"
     each = [(of_tool(out, j), name) for j, name in enumerate(names)] or [(out, "")]
     lines = (row(i, *one) for i in pick.tolist() for one in each)
-    Console().print(table(Table(lines, columns, title=title)))
+    say(Table(lines, columns, title=title))

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from jaxtrachea.cli.terminal import Stop, set_up_jax, table
+from jaxtrachea.cli.terminal import Stop, say, say_written, set_up_jax
 
 DtypeOption = Annotated[str, typer.Option("--dtype", help="Precision: float32, float64 or both.")]
 OnlyOption = Annotated[
@@ -47,20 +46,19 @@ def selfcheck(
     set_up_jax()
     from jaxtrachea.selfcheck.run import run_table
 
-    out, found = Console(), []
     found = list(run_table(cases, read_truth(), _Dtype[dtype].value, unoptimised=quick))
     if not found:
         raise Stop(f"--only, --dtype {dtype}: none of these cases is run in this dtype")
     seconds = time.perf_counter() - start
-    out.print(table(_table(found)))
+    say(_table(found))
     for outcome in found:
         for fault in outcome.faults:
-            out.print(f"{outcome.case} ({outcome.dtype}): {fault}", markup=False, highlight=False)
+            say(f"{outcome.case} ({outcome.dtype}): {fault}")
     failed = sum(not o.passed for o in found)
-    out.print(_summary(found, failed, seconds), highlight=False)
+    say(_summary(found, failed, seconds))
     if out_dir is not None:
         _write(out_dir, found, seconds, quick)
-        out.print(f"written to {out_dir}", markup=False, highlight=False, soft_wrap=True)
+        say_written(out_dir)
     raise typer.Exit(1 if failed else 0)
 
 

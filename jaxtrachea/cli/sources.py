@@ -154,15 +154,12 @@ def as_options(text: str) -> str:
 
 
 def _expanded(paths: Sequence[Path]) -> list[Path]:
-    """Files of the arguments, each once; a folder stands for the data files in it.
-
-    Raises:
-        Stop: there is no such file, or it is a specification, or a folder without data files.
-    """
+    """Files of the arguments, each once; a folder stands for the data files in it."""
     files: dict[Path, None] = {}
     for path in paths:
         if path.is_dir():
-            inside = [p for p in sorted(path.iterdir()) if p.is_file() and _is_data(p)]
+            shown = (p for p in sorted(path.iterdir()) if p.is_file() and p.name[:1] != ".")
+            inside = [p for p in shown if p.name.lower().endswith(ENDINGS)]
             if not inside:
                 known = ", ".join(ENDINGS)
                 raise Stop(f"{path}: a folder without data files ({known}); name the files")
@@ -181,16 +178,8 @@ def _expanded(paths: Sequence[Path]) -> list[Path]:
     return list(files)
 
 
-def _is_data(path: Path) -> bool:
-    return path.name.lower().endswith(ENDINGS) and not path.name.startswith(".")
-
-
 def _options(keys: dict[str, Any]):
-    """How to read, of what was said.
-
-    Raises:
-        Stop: it cannot be.
-    """
+    """How to read, of what was said."""
     from jaxtrachea._errors import InputError
     from jaxtrachea.measurements.curve import ReadOptions
     from jaxtrachea.measurements.readers import reader_of
@@ -208,11 +197,7 @@ def _options(keys: dict[str, Any]):
 
 
 def _heads(files: Sequence[Path], keys: dict[str, Any]) -> dict[Path, Any]:
-    """Heads of the files that can be opened; what is wrong with others is said when they are read.
-
-    Raises:
-        Stop: the only file cannot be opened.
-    """
+    """Heads of the files that can be opened; reading says what is wrong with the others."""
     from jaxtrachea.measurements.heads import head_of
     from jaxtrachea.measurements.read import DataError
 
@@ -227,11 +212,7 @@ def _heads(files: Sequence[Path], keys: dict[str, Any]) -> dict[Path, Any]:
 
 
 def _read(files: Sequence[Path], keys: dict[str, Any]):
-    """The measurements.
-
-    Raises:
-        Stop: the files cannot be read so.
-    """
+    """The measurements."""
     from jaxtrachea.config import DataSection, FitSpec, SpecError
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError

@@ -54,11 +54,7 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
 
 
 def _baseline(spec: FitSpec) -> Mapping[str, ParameterSection]:
-    """The parameter that `data.baseline` stands for.
-
-    Raises:
-        SpecError: it is named beside it.
-    """
+    """The parameter that `data.baseline` stands for."""
     if spec.data.baseline == "auto":
         return {}
     if "force_slope" in spec.parameters:
@@ -71,11 +67,7 @@ def _baseline(spec: FitSpec) -> Mapping[str, ParameterSection]:
 
 
 def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:
-    """Parameters as the model begins with them.
-
-    Raises:
-        SpecError: with the key.
-    """
+    """Parameters as the model begins with them."""
     try:
         wall = None if spec.wall is None else Wall(**spec.wall.model_dump())
     except InputError as error:
@@ -99,11 +91,7 @@ def options_of(spec: FitSpec) -> Options:
 
 
 def _parameter(default: Parameter, section: ParameterSection | None) -> Parameter:
-    """One row of the table.
-
-    Raises:
-        SpecError: with the dotted key.
-    """
+    """One row of the table."""
     if section is None:
         return default
     try:
@@ -190,11 +178,7 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
 
 
 def _lines(spec: FitSpec, measurements: Measurements, options: Options, table):
-    """Why each curve has no line below its force, where all are to have one; else None each.
-
-    Raises:
-        SpecError: the contact is bonded, so that no record begins before it.
-    """
+    """Why each curve has no line below its force, where all are to have one; else None each."""
     if spec.data.baseline == "slope" and options.contact != "unilateral":
         raise SpecError(
             "data.baseline: 'slope' needs samples before first touch, which contact = 'bonded' "
@@ -218,8 +202,6 @@ def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False)
     Levenberg-Marquardt get one dense lane in place of the joint study.
 
     Args:
-        spec: the specification.
-        measurements: what to fit.
         refits: something that refits lanes was asked for outside the specification.
 
     Raises:
@@ -246,11 +228,7 @@ def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False)
 
 
 def _with_groups(study: Study, spec: FitSpec, measurements: Measurements) -> Study:
-    """With the groups of `data.together`.
-
-    Raises:
-        SpecError: groups that the trials do not have.
-    """
+    """With the groups of `data.together`."""
     if not spec.data.together:
         return study
     try:
@@ -284,11 +262,7 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
 
 
 def _noise(spec: FitSpec) -> Noise:
-    """The [noise] section.
-
-    Raises:
-        SpecError: with the dotted key.
-    """
+    """The [noise] section."""
     force, joints = (
         None if isinstance(sigma, str) else sigma for sigma in (spec.noise.force, spec.noise.joints)
     )

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -22,13 +23,14 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from jaxtrachea.cli.terminal_table import wide_table as table
+from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.pictures import sentence
 from jaxtrachea.files.programs import count_uses, keep_bounds
+from jaxtrachea.files.table import Table
 
 __all__ = [
     "Kept", "Stages", "Stop", "cache_folder", "complain", "interrupts", "into", "programs_folder",
-    "progress_bar", "quiet_compiler", "say_lost", "set_up_jax", "table", "to_stderr",
+    "progress_bar", "quiet_compiler", "say", "say_lost", "say_written", "set_up_jax", "to_stderr",
 ]  # fmt: skip
 
 
@@ -56,10 +58,27 @@ def complain(message: str) -> int:
     return 2
 
 
+def say(*what: str | Table, wrap: bool = True) -> None:
+    """Tables, and lines as they are: what looks like markup in them is none."""
+    plain = partial(Console().print, markup=False, highlight=False, emoji=False)
+    for one in what:
+        if not isinstance(one, Table):
+            plain(one, soft_wrap=not wrap)
+            continue
+        plain(wide_table(one))
+        if one.more:
+            plain(one.more)
+
+
 def say_lost(pictures: Mapping[str, str]) -> None:
     """Warn of pictures that could not be drawn; the numbers stand."""
     for name, reason in pictures.items():
         to_stderr(f"[yellow]warning:[/] {escape(sentence(name, reason))}")
+
+
+def say_written(path: Path) -> None:
+    """Where the files of a command are."""
+    say(f"written to {path}", wrap=False)
 
 
 class Interrupts:
@@ -224,10 +243,6 @@ class Stages:
 @contextlib.contextmanager
 def into(out_dir: Path | None, default: Path) -> Iterator[tuple[Path, Callable[[], None]]]:
     """Claim the output folder and watch for Ctrl-C; failures to write become `Stop`.
-
-    Args:
-        out_dir: what the user asks for.
-        default: where to write else.
 
     Yields:
         The folder to write into, and what raises KeyboardInterrupt if Ctrl-C came.

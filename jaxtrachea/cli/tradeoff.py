@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea.cli.options import OutOption
-from jaxtrachea.cli.terminal import Stop, into, progress_bar, table
+from jaxtrachea.cli.terminal import Stop, into, progress_bar, say, say_written
 
 SceneArgument = Annotated[
     Path | None, typer.Argument(help="Scene file (default: a ball on the tube of Table 1).")
@@ -61,7 +59,7 @@ def tradeoff(
         clock.append(time.perf_counter())
         _write(folder, rows, scene, inputs, clock)
     _print(rows)
-    Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    say_written(folder.parent)
 
 
 def _full(scene: Path | None):
@@ -104,10 +102,8 @@ def measured_curves(data: Path | None):
 def _write(folder: Path, rows, scene: Path | None, inputs, clock) -> None:
     import json
 
-    import jax
-
     from jaxtrachea.files.atomic import write_text
-    from jaxtrachea.files.provenance import provenance
+    from jaxtrachea.files.provenance import provenance, write_provenance
     from jaxtrachea.tradeoff.levels import BUILT_IN
     from jaxtrachea.tradeoff.table import measured_table
 
@@ -118,24 +114,20 @@ def _write(folder: Path, rows, scene: Path | None, inputs, clock) -> None:
     write_text(folder / "tradeoff.jsonl", text)
     points = [row for row in rows if "left_out" not in row]
     measured_table(points).write_csv(folder / "tradeoff.csv")
-    seconds = {k: clock[i + 1] - clock[i] for i, k in enumerate(("read", "compute"))}
-    made = provenance(scene, inputs, str(jax.devices()[0]), "float64, float32", seconds)
-    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    made = provenance(scene, inputs, "float64, float32", ("read", "compute"), clock)
+    write_provenance(folder, made)
 
 
 def _print(rows) -> None:
     from jaxtrachea.tradeoff.load import load_warning
     from jaxtrachea.tradeoff.table import KINDS, measured_table
 
-    out = Console()
     points = [row for row in rows if "left_out" not in row]
     for kind, title in KINDS.items():
         if of_kind := [point for point in points if point["kind"] == kind]:
-            out.print(table(measured_table(of_kind, title)))
+            say(measured_table(of_kind, title))
     for row in rows:
         if "left_out" in row:
-            text = f"left out: {row['ladder']}: {row['left_out']}"
-            out.print(escape(text), highlight=False)
+            say(f"left out: {row['ladder']}: {row['left_out']}")
     loads = [point["others"] for point in points if point["others"] is not None]
-    for text in load_warning(max(loads, default=None)):
-        out.print(text, highlight=False)
+    say(*load_warning(max(loads, default=None)))

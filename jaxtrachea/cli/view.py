@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
+from jaxtrachea.cli.terminal import Stop, say, say_written, set_up_jax, to_stderr
 
 PortOption = Annotated[
     int | None, typer.Option("--port", min=1, max=65535, help="Of 127.0.0.1; none: a free one.")
@@ -38,7 +36,7 @@ def view(
         raise Stop(f"--port: {port} cannot be used ({error.strerror}); {cure}") from None
 
     def opened(address: str) -> None:
-        Console().print(f"{escape(address)}  (Ctrl-C ends it)", highlight=False, soft_wrap=True)
+        say(f"{address}  (Ctrl-C ends it)", wrap=False)
         if not no_browser and not _open(address):
             to_stderr("no browser could be opened: open the address yourself, or use --no-browser")
 
@@ -53,11 +51,7 @@ def view(
 
 
 def _content(file: Path) -> dict:
-    """Tables of a scene or a fit.
-
-    Raises:
-        Stop: no such file, no TOML, or a scene that no hand can move.
-    """
+    """Tables of a scene or a fit."""
     from jaxtrachea.files.toml import SpecError, read_tables
 
     if not file.is_file():
@@ -78,11 +72,7 @@ def _content(file: Path) -> dict:
 
 
 def _experiment(path: Path, begin: Callable[[str], None]):
-    """The curves of a fit specification, and the `Online` that will take their samples.
-
-    Raises:
-        ValueError: what cannot be read, or cannot be fitted sample by sample.
-    """
+    """The curves of a fit specification, and the `Online` that will take their samples."""
     from jaxtrachea.cli.load import load
     from jaxtrachea.inference.online import Online
     from jaxtrachea.viewer.stream import Experiment
@@ -131,7 +121,7 @@ def play(
         raise Stop(str(error)) from None
     except OSError as error:
         raise Stop(f"{path}: cannot be written ({error.strerror}); choose another --out") from None
-    Console().print(f"written to {escape(str(path))}", highlight=False, soft_wrap=True)
+    say_written(path)
 
 
 def _open(address: str) -> bool:

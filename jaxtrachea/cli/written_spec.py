@@ -38,9 +38,6 @@ def specification_text(sources: Sources, out: Path, blocked: Mapping[str, str]) 
         sources: the files as read.
         out: where the specification will stand; its paths start from there.
         blocked: why it cannot be fitted as it is, by the section that the cure goes into.
-
-    Returns:
-        Text that `config.load_fit_spec` reads.
     """
     lines = [
         f"# Written by jaxtrachea {__version__}. Lines that begin with # are not read; those of",

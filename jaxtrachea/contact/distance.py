@@ -87,6 +87,7 @@ class Contact(eqx.Module):
     status: Int[Array, ""]
 
 
+@functools.partial(jax.jit, static_argnames="settings", inline=True)
 def signed_distance(
     a: Shape,
     b: Shape,
@@ -94,7 +95,6 @@ def signed_distance(
     settings: Settings = STANDARD,
     *,
     beta: Float[Array, ""] | None = None,
-    table: Float[Array, " directions"] | None = None,
 ) -> Contact:
     """Signed distance of two convex shapes, searched over all directions.
 
@@ -107,41 +107,15 @@ def signed_distance(
         a: shape A.
         b: shape B, of the same dtype.
         pose: from B's frame to A's.
-        settings: accuracy and work.
         beta: sharpness, 1/mm, positive; default `settings.sharpness` over the size of the pair,
             without the derivative of that size.
-        table: `direction_table(a, settings)`, to share it between poses.
 
     Returns:
         The `Contact`; differentiable in a, b, pose and beta.
-
-    Raises:
-        ValueError: a table of another length than `settings.directions`.
     """
-    if table is not None and table.shape != (settings.directions,):
-        raise ValueError(
-            f"table: expected shape ({settings.directions},), found {table.shape}; "
-            "use direction_table with the same settings"
-        )
-    return _signed_distance(a, b, pose, settings, beta, table)
-
-
-@functools.partial(jax.jit, static_argnames="settings", inline=True)
-def _signed_distance(
-    a: Shape,
-    b: Shape,
-    pose: Pose,
-    settings: Settings,
-    beta: Float[Array, ""] | None,
-    table: Float[Array, " directions"] | None,
-) -> Contact:
-    """`signed_distance`, of arguments that are checked."""
     scaled = _scaled(a, b, pose, settings, beta)
-    pair, size = jax.lax.stop_gradient((scaled.pair, scaled.size))
-    if table is None:
-        rows = sharp_table(pair.a, settings.directions)
-    else:
-        rows = jax.lax.stop_gradient(table) / size
+    pair = jax.lax.stop_gradient(scaled.pair)
+    rows = sharp_table(pair.a, settings.directions)
     d, tied = find_normal(pair, rows, _towards(pair), settings)
     return _contact(a, b, scaled, d, tied)
 
@@ -168,9 +142,6 @@ def track(
         direction: not zero, need not be of length 1, taken without derivative; shape (3,).
         settings: `sharpness` and `warm_steps` are used.
         beta: as in `signed_distance`.
-
-    Returns:
-        The `Contact`, as `signed_distance`.
     """
     return _track(a, b, pose, direction, settings, beta)
 
@@ -216,12 +187,6 @@ def approach(
     else:
         d, _ = descend(pair, d, settings.warm_steps + 2)
     return _contact(a, b, scaled, d)
-
-
-def direction_table(a: Shape, settings: Settings = STANDARD) -> Float[Array, " directions"]:
-    """Support of A about its centre over the coarse directions, mm; the same for every pose."""
-    centre = mean(a.vertices, a.counts)
-    return sharp_table(a.vertices - centre[:, None], settings.directions)
 
 
 class _Scaled(eqx.Module):

@@ -39,7 +39,6 @@ def skeleton_coordinates(
     itself phi is 0, with derivative 0.
 
     Args:
-        line: the centreline.
         point: mm; shape (3,).
     """
 
@@ -68,7 +67,6 @@ def point_at(line: Centreline, s: Float[Array, ""]) -> tuple[Float[Array, "3"], 
     the ends the line goes on straight.
 
     Args:
-        line: the centreline.
         s: arc length, mm.
     """
     last = line.s.shape[0] - 1

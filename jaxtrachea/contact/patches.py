@@ -166,7 +166,6 @@ def touch(
     Args:
         tool: a convex shape, or several (`shapes.compound`), of the dtype of the patches.
         pose: from the tool's frame to the tube's.
-        patches: the tube.
         settings: accuracy and work of each signed distance.
         near: number of patches searched, those with the lowest bounds. Two are enough for tools
             about as long as a patch; `Touch.complete` says so. Of a tool of several parts that of

@@ -152,7 +152,6 @@ def check_rotations(name: str, rotations: Float[np.ndarray, "rows 3 3"]) -> None
     """Refuse matrices that are no rotations; those that are not finite are left to statuses.
 
     Args:
-        name: of the argument, for the message.
         rotations: concrete numbers.
 
     Raises:

@@ -77,11 +77,7 @@ class Settings:
     warm_steps: int = 10
 
     def __post_init__(self):
-        """Refuse settings that cannot work.
-
-        Raises:
-            ValueError: naming the setting, what was expected and what was found.
-        """
+        """Refuse settings that cannot work (`ValueError`)."""
         check_record(self)
         least = {"directions": 16, "starts": 1, "survivors": 1, "coarse_steps": 0}
         least |= {"fine_steps": 1, "final_steps": 1, "warm_steps": 1}
@@ -358,7 +354,6 @@ def find_normal(pair: Pair, table, centre, settings: Settings):
         pair: the two shapes.
         table: max_i v_i . d of A over the coarse directions.
         centre: unit vector from the centre of A to that of B.
-        settings: the work to be done.
     """
     s = settings
     first = jnp.minimum(jnp.asarray(FIRST_SHARPNESS, pair.beta.dtype), pair.beta)

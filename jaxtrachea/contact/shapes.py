@@ -80,7 +80,6 @@ def support(shape: Shape, direction: Float[Array, "3"], beta: Float[Array, ""]) 
     """Smoothed support function, its boundary point and the softmax mean.
 
     Args:
-        shape: a convex shape.
         direction: unit vector; shape (3,).
         beta: sharpness, 1/mm, positive. The bias is at most log(n) / beta.
     """
@@ -317,7 +316,6 @@ def padded(shape: Shape, count: int) -> Shape:
     For stacking shapes under `vmap`.
 
     Args:
-        shape: a convex shape.
         count: number of vertices wanted, not below the present one.
 
     Raises:

@@ -117,11 +117,7 @@ class _Tube(NamedTuple):
 def _check(
     v: np.ndarray, s: np.ndarray, curved: tuple, numbers: tuple[float, float, float, int]
 ) -> None:
-    """Refuse arguments of `patches_of` that mean no tube.
-
-    Raises:
-        ValueError: naming the argument.
-    """
+    """Refuse arguments of `patches_of` that mean no tube."""
     if v.ndim != 2 or v.shape[1] != 3 or s.shape != v.shape[:1] or not np.isfinite(v).all():
         raise ValueError(
             f"vertices, s: expected finite (n, 3) and (n,), found {v.shape} and {s.shape}"
@@ -137,11 +133,7 @@ def _check(
 
 
 def _between(tube: _Tube, span: tuple[float, float], overlap: float, rounding: float, most: int):
-    """The patch between two borders, as `_patch`.
-
-    Raises:
-        ValueError: naming the span.
-    """
+    """The patch between two borders, as `_patch`."""
     from scipy.spatial import QhullError
 
     (low, high), (v, s, edges, line) = span, tube

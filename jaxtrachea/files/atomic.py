@@ -8,7 +8,6 @@ import contextlib
 import errno
 import io
 import os
-import shutil
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,7 +32,6 @@ def write_whole(path: Path, data: bytes) -> None:
 
     Args:
         path: file, replaced if it exists.
-        data: its content.
 
     Raises:
         OSError: nothing was written; a file of that name is as it was.
@@ -103,36 +101,26 @@ class _Image:
 
 
 @contextlib.contextmanager
-def hdf5_file(path: Path, mode: str = "x") -> Iterator[Any]:
-    """An HDF5 file that is in its place when the block ends; nothing is if it raises.
-
-    Args:
-        path: of the file.
-        mode: `x`: new; `r+`: one that exists, with more written into it.
-
-    Yields:
-        The open `h5py.File`.
+def hdf5_file(path: Path) -> Iterator[Any]:
+    """A new HDF5 file that is in its place when the block ends; nothing is if it raises.
 
     Raises:
-        FileExistsError: mode `x`, and there is one.
-        OSError: it cannot be read or written.
+        FileExistsError: there is one.
+        OSError: it cannot be written.
     """
     import h5py
 
-    if mode == "x" and path.exists():
+    if path.exists():
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-    with _put_into_place(path) as beside:
-        if mode != "x":
-            shutil.copyfile(path, beside)
-        with beside.open("w+b" if mode == "x" else "r+b", buffering=0) as stream:
-            image = _Image(stream)
-            try:
-                with h5py.File(image, "w" if mode == "x" else mode) as file:
-                    yield file
-            finally:
-                if image.error is not None:
-                    raise image.error
-            os.fsync(stream.fileno())
+    with _put_into_place(path) as beside, beside.open("w+b", buffering=0) as stream:
+        image = _Image(stream)
+        try:
+            with h5py.File(image, "w") as file:
+                yield file
+        finally:
+            if image.error is not None:
+                raise image.error
+        os.fsync(stream.fileno())
 
 
 def write_text(path: Path, text: str) -> None:

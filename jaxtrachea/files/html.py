@@ -18,6 +18,8 @@ from markdown_it.token import Token
 #: Rows of a table; beyond it a note says where the rest is.
 ROWS = 200
 
+#: Tokens of the rows of a table.
+_OF_ROWS = ("inline", "tr_open", "tr_close", "td_open", "td_close")
 #: Paragraphs that begin with such a mark are a verdict, in a colour that nobody takes for another
 #: (Okabe and Ito 2008, Color universal design): blue, orange, vermilion.
 MARKS = {"✓ ": "good", "⚠ ": "fair", "✗ ": "poor"}
@@ -142,16 +144,11 @@ def _short_tables(tokens: Sequence[Token]) -> list[Token]:
             rows = -1  # the head
         if token.type == "tr_open":
             rows += 1
-        if rows <= ROWS or not _in_row(token):
+        if rows <= ROWS or token.type not in _OF_ROWS:
             kept.append(token)
         if token.type == "table_close":
             kept.append(_markup(f"</div>{_note(rows)}\n"))
     return kept
-
-
-def _in_row(token: Token) -> bool:
-    """Whether a token of a table belongs to one of its rows."""
-    return token.type in ("inline", "tr_open", "tr_close", "td_open", "td_close")
 
 
 def _markup(text: str) -> Token:

@@ -99,11 +99,7 @@ def optimise(paths: list[Path]) -> None:
 
 
 def optimise_afterwards(paths: list[Path]) -> None:
-    """Start a process that optimises traces, with this one's settings; it is not waited for.
-
-    Args:
-        paths: files of one folder.
-    """
+    """Start a process that optimises traces, with this one's settings; it is not waited for."""
     # Imports as this process does, without its working folder: that may be taken away meanwhile.
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(sys.path),

@@ -64,10 +64,6 @@ def refuse_full(wanted: Path, *, held: bool = False) -> None:
 def new_output(wanted: Path | None, default: Path) -> Iterator[Path]:
     """Claim an output folder at once and fill it all together or not at all.
 
-    Args:
-        wanted: as for `new_directory`.
-        default: as for `new_directory`.
-
     Yields:
         A folder to write into. Its files move to the claimed one (its parent) when the block ends;
         if the block raises, they and the folders made for them are removed.

@@ -27,12 +27,7 @@ STYLE: dict[Any, object] = {
 
 
 def plain(name: str, longest: int = LONGEST) -> str:
-    """A name as matplotlib shall show it: one line, no mathematics, not hidden, not endless.
-
-    Args:
-        name: any text.
-        longest: characters that are shown.
-    """
+    """A name as matplotlib shall show it: one line, no mathematics, not hidden, not endless."""
     words = " ".join("".join(c if c.isprintable() else " " for c in name).split())
     short = words if len(words) <= longest else f"{words[: longest - 1]}…"
     # matplotlib draws "\$" as "$", and what holds no other "$" is no mathematics.
@@ -48,7 +43,6 @@ def save_each(
     `Figure.savefig` goes through a figure twice, the first time without drawing it.
 
     Args:
-        folder: where to.
         drawings: file name, with its ending (`png` or `svg`), to what returns the figure.
 
     Returns:

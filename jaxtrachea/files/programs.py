@@ -99,11 +99,7 @@ def keep_bounds(folder: Path, now: float | None = None) -> int:
     """Delete programs beyond the bounds of size and age, at most once a day.
 
     Args:
-        folder: of the programs.
         now: seconds since the epoch; None: those of the clock.
-
-    Returns:
-        How many were deleted.
     """
     now = time.time() if now is None else now
     mark = folder / LAST_LOOK

@@ -3,12 +3,16 @@
 import datetime
 import functools
 import hashlib
+import itertools
+import json
 import platform
 import sys
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import jaxtrachea
+from jaxtrachea.files.atomic import write_text
 
 
 def installed(package: str) -> str:
@@ -31,17 +35,17 @@ def source_digest() -> str:
 
 
 def provenance(
-    spec: Path, inputs: dict[str, str], device: str, dtype: str, timings: dict[str, float]
+    spec: Path, inputs: dict[str, str], dtype: str, phases: Sequence[str], clock: Sequence[float]
 ) -> dict[str, object]:
     """Everything needed to repeat a run: versions, device, dtype, SHA-256 of every input.
 
     Args:
-        spec: the specification file.
         inputs: SHA-256 by measurement file.
-        device: as JAX names it.
-        dtype: of the computation.
-        timings: seconds by phase.
+        phases: names of what was done, one after the other.
+        clock: when the first began, and when each ended, s.
     """
+    import jax
+
     versions = {"python": platform.python_version(), "platform": platform.platform()}
     for name in ("jaxtrachea", "jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "h5py"):
         versions[name] = installed(name)
@@ -49,12 +53,20 @@ def provenance(
         "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "versions": versions,
-        "device": device,
+        "device": str(jax.devices()[0]),
         "dtype": dtype,
         "specification": {
             "file": spec.name,
             "sha256": hashlib.sha256(spec.read_bytes()).hexdigest(),
         },
         "inputs": {Path(name).name: digest for name, digest in inputs.items()},
-        "seconds": {name: round(value, 3) for name, value in timings.items()},
+        "seconds": {
+            name: round(end - begin, 3)
+            for name, (begin, end) in zip(phases, itertools.pairwise(clock), strict=True)
+        },
     }
+
+
+def write_provenance(folder: Path, made: Mapping[str, object]) -> None:
+    """Write provenance.json."""
+    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")

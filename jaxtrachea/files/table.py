@@ -239,14 +239,7 @@ def ends(low: str, high: str) -> Callable[[Row], object]:
 
 
 def words(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left=()) -> Table:
-    """A table for people alone, of text.
-
-    Args:
-        title: above it.
-        head: of the columns.
-        rows: text of every cell.
-        left: heads of columns set to the left.
-    """
+    """A table for people alone, of text."""
     columns = [Column(name, str(i), left=name in left) for i, name in enumerate(head)]
     return Table(({str(i): v for i, v in enumerate(row)} for row in rows), columns, title=title)
 

@@ -32,7 +32,6 @@ def load_spec(
     """Read and validate a specification of any kind.
 
     Args:
-        path: the TOML file.
         kind: the record it must fit.
         called: what a user calls it.
         others: a table that only another kind of file has, and what that file is.
@@ -57,10 +56,6 @@ def load_spec(
 def read_tables(path: Path, called: str) -> dict[str, Any]:
     """Read a TOML file.
 
-    Args:
-        path: of the file.
-        called: what a user calls it.
-
     Raises:
         SpecError: it cannot be read, or is no TOML.
     """
@@ -82,11 +77,7 @@ def read_tables(path: Path, called: str) -> dict[str, Any]:
 
 
 def _text(path: Path, called: str) -> str:
-    """Content of a specification.
-
-    Raises:
-        SpecError: no such file, none at all, too long, or not UTF-8.
-    """
+    """Content of a specification."""
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise SpecError("is a device or a pipe", place=str(path), expected=f"a TOML {called}")

@@ -174,11 +174,7 @@ class Traced:
         return compiled
 
     def _traced(self, leaves: list, tree: Any, device: Any, donated: tuple) -> KeptTrace:
-        """The trace of arguments like these.
-
-        Raises:
-            TypeError: what it returns has weak types, which a trace does not keep.
-        """
+        """The trace of arguments like these."""
         made = []
 
         def flat(*leaves):
@@ -204,11 +200,7 @@ class Traced:
 
 
 def _kind(leaf: Any, device: Any) -> tuple:
-    """Shape, dtype and whether its type is weak, of an argument.
-
-    Raises:
-        TypeError: not an array of that device, or no array.
-    """
+    """Shape, dtype and whether its type is weak, of an argument."""
     if isinstance(leaf, np.ndarray | np.generic):
         return leaf.shape, leaf.dtype, False
     if isinstance(leaf, jax.Array):
@@ -248,11 +240,7 @@ def _said(value: Any) -> bytes:
 
 
 def _sources() -> str:
-    """Digest of this package's sources, and the versions of what they stand on.
-
-    Raises:
-        RuntimeError: the sources may not be those that this process has read.
-    """
+    """Digest of this package's sources, and the versions of what they stand on."""
     for path in Path(jaxtrachea.__file__).parent.rglob("*.py"):
         found = path.stat()
         if max(found.st_mtime, found.st_ctime) > _start:

@@ -80,14 +80,7 @@ class Assessment(NamedTuple):
 
 
 def assess(result: Any, lane: int, i: int, profiles: Intervals | None = None) -> Assessment:
-    """Verdict and interval of an unknown: the one place where both are decided.
-
-    Args:
-        result: the fit, with the evidence that it has gathered by itself.
-        lane: of the result.
-        i: unknown of the lane.
-        profiles: further profiles, which come on top.
-    """
+    """Verdict and interval of an unknown: the one place where both are decided."""
     if profiles is not None:
         return _assess(result, lane, i, profiles)
     if (lane, i) not in result.assessments:  # tables, files and report all ask

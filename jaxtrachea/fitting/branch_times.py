@@ -32,11 +32,6 @@ def unsampled_time(result: Any, lane: int, i: int) -> str:
     Its time, with the 95 % interval, has to lie between the least step of the samples and the
     longest record. The density `C` of `fung` is an estimate where times from tau_1 to tau_2 surely
     lie there, and the numbers of `power` where the records span a decade of time.
-
-    Args:
-        result: the `FitResult`.
-        lane: of it.
-        i: unknown of the lane.
     """
     model, (unknown, specimen, trial) = result.study.model, result.study.unknowns[lane][i]
     if not model.relaxes:
@@ -70,7 +65,8 @@ def unsampled_time(result: Any, lane: int, i: int) -> str:
     number = len(whole) if law != "fung" else int(base[-1])
     called = f"tau_{number}{part}"
     if high > span.longest:
-        return f"the record is shorter than {called}: {span.longest:.3g} s, {called} {_to(high)}"
+        to = f"up to {high:.3g} s" if np.isfinite(high) else "without limit"
+        return f"the record is shorter than {called}: {span.longest:.3g} s, {called} {to}"
     if low < span.shortest:
         step = f"{span.shortest:.3g} s"
         return f"samples are further apart than {called}: {step}, {called} down to {low:.3g} s"
@@ -79,10 +75,6 @@ def unsampled_time(result: Any, lane: int, i: int) -> str:
 
 def _times(span: Span) -> str:
     return f"{span.shortest:.3g} to {span.longest:.3g} s"
-
-
-def _to(high: float) -> str:
-    return f"up to {high:.3g} s" if np.isfinite(high) else "without limit"
 
 
 def _interval(

@@ -107,7 +107,6 @@ def assemble(model: FitModel, parts: Array, lane: Lane) -> Array:
     """Sum what each trial gives for its columns into the unknowns they read.
 
     Args:
-        model: what is fitted (static).
         parts: (T, Jf) or (T, Jf, Jf).
         lane: tells which unknown each column reads.
     """
@@ -128,7 +127,6 @@ def rounding_cost(model: FitModel, lane: Lane, sigma: Any, dtype: Any = None) ->
     An equilibrium found by iteration leaves more than a formula (`Level.roundings`).
 
     Args:
-        model: what is fitted (static).
         lane: without or with leading axes.
         sigma: of (force, markers), likewise.
         dtype: of the computation; None: that of the lane.

@@ -47,7 +47,6 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
     the same the estimate is not quite its maximum.
 
     Args:
-        study: what was fitted.
         info: of all lanes at their estimates.
         alive: lanes that count in a joint study.
     """

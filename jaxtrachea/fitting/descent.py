@@ -35,7 +35,6 @@ def cost(
     """Half the weighted sum of rho(residual^2) of one lane; differentiable in all arrays.
 
     Args:
-        model: what is fitted (static).
         theta: unknowns in scaled coordinates (`Parameter.to_scaled`).
         lane: arrays of the lane.
         sigma: standard deviation of force and markers in units of the lane's precision.
@@ -61,11 +60,7 @@ class Descent:
     learning_rate: float = 0.03
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self)
 
     @property

@@ -84,12 +84,7 @@ def _lag_correlation(residual: Float[np.ndarray, "lanes trials samples"]) -> np.
 def share_independent(
     correlation: Float[np.ndarray, "*l"], pairs: Int[np.ndarray, "*l"]
 ) -> Float[np.ndarray, "*l"]:
-    """n_eff / n of AR(1) noise; 1 where independent noise has so large a correlation by chance.
-
-    Args:
-        correlation: of neighbours.
-        pairs: that it is of.
-    """
+    """n_eff / n of AR(1) noise; 1 where independent noise has so large a correlation by chance."""
     with np.errstate(divide="ignore"):
         by_chance = correlation < CHANCE / np.sqrt(pairs)
     r = np.where(by_chance, 0.0, np.clip(correlation, 0, 1))

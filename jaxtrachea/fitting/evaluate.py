@@ -21,9 +21,6 @@ from jaxtrachea.status import FitStatus
 def evaluated(study: Study) -> FitResult:
     """Cost, residuals, noise and criteria of a study without unknowns.
 
-    Args:
-        study: whose `size` is 0.
-
     Returns:
         A `FitResult` with 0 unknowns and iterations; lanes without finite forces are NON_FINITE.
     """

@@ -69,12 +69,7 @@ def few_samples(study: Study) -> Study:
 def same_ends(
     rows: Int[np.ndarray, " starts"], solved: Solved
 ) -> tuple[Int[np.ndarray, " ends"], Int[np.ndarray, " starts"]]:
-    """Starts that ended apart, one of each lane and end, and which of them each start ended with.
-
-    Args:
-        rows: lane of each start.
-        solved: where they ended; one that did not converge ended by itself.
-    """
+    """Starts that ended apart, one of each lane and end, and the place among them of every one."""
     own = np.where(solved.status == FitStatus.CONVERGED, 0, 1 + np.arange(len(rows)))
     cells = np.column_stack([rows, own, np.round(solved.theta / SAME)])
     _, first, of = np.unique(cells, axis=0, return_index=True, return_inverse=True)

@@ -102,7 +102,6 @@ def with_omitted_zeros(
 
     Args:
         study: as `build_study` made it.
-        result: its fit.
         settings: how to solve.
         progress: as for `fit`.
     """

@@ -35,12 +35,7 @@ class FittedErrors(NamedTuple):
 
 
 def fitted_errors(result: FitResult, lanes: Int[np.ndarray, " n"]) -> FittedErrors:
-    """Standard errors of the fitted values, and residuals over their standard deviation.
-
-    Args:
-        result: the fit.
-        lanes: which lanes.
-    """
+    """Standard errors of the fitted values, and residuals over their standard deviation."""
     study = result.study
     slopes, covariance = _slopes(result, lanes), _covariance(result, lanes)
     fitted, studentised = {}, {}

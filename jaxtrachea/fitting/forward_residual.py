@@ -28,11 +28,9 @@ def answer(
     """What the model shows in one trial, its force as the load cell records it.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
         motion: of the tool; its onset is that of the parameters.
-        tube: the geometry.
     """
     values = values_of(model, free, value)
     moved = motion._replace(onset=values["onset"])
@@ -49,10 +47,8 @@ def residual(
     """Whitened differences of all trials, and their derivative by the free columns.
 
     Args:
-        model: what is fitted (static).
         free: of every trial, scaled coordinates.
         trials: the arrays of a lane that have a trial axis.
-        tube: the geometry.
     """
     eye = jnp.eye(free.shape[1], dtype=free.dtype)
 

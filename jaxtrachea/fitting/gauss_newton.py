@@ -43,12 +43,7 @@ class GaussNewton:
     """
 
     def __init__(self, study: Study, dtype: np.dtype):
-        """No sample yet; compiles what is needed later.
-
-        Args:
-            study: as for `Stream`.
-            dtype: likewise.
-        """
+        """No sample yet; compiles what is needed later."""
         self._empty(study, dtype)
         self.begin(float(study.lanes.s_c[0, 0]))
         self.append(*np.asarray([study.lanes.displacement[0, 0], study.lanes.force[0, 0]]))

@@ -53,11 +53,7 @@ class Noise:
     force_by_curve: bool = False
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self)
         if isinstance(self.force_share, float) and not 0 <= self.force_share < 1:
             found = f"is {self.force_share:g}"
@@ -107,11 +103,7 @@ class Weighting:
     pressed_ends: bool = True
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self)
         if self.loss_scale <= 0:
             raise ValueError(
@@ -144,7 +136,6 @@ def unknowns_of(
 
     Args:
         lane: its curves.
-        parameters: the table.
         taken: what each curve takes of the free parameters that are `auto`; None: all.
     """
     names: dict[Unknown, None] = {}
@@ -246,8 +237,6 @@ def lanes_of(
     Args:
         groups: curves of each lane.
         unknowns: of each lane.
-        parameters: the table.
-        geometry: the tube.
         noise: known standard deviations.
         weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
         tool_radius: see `build.build_study`.

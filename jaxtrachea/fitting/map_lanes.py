@@ -32,7 +32,6 @@ def map_lanes(
             lane, and one program serves all.
         rows: lane of each row; None: all lanes in order.
         static: arguments between model and arrays, by value.
-        dtype: of the computation.
         progress: called with the number of rows done since the last call.
         unoptimised: whether the program is compiled without optimisation; None: as for so many
             rows that are evaluated. Who calls many times with few rows, or solves, has to say.

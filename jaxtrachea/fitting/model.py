@@ -37,11 +37,7 @@ class Column:
     fixed: bool
 
     def __post_init__(self):
-        """Refuse words that mean nothing.
-
-        Raises:
-            ValueError: naming the column, what was found and what is expected.
-        """
+        """Refuse words that mean nothing (`ValueError`)."""
         check_word(f"{self.name}: scale", self.scale, Scale)
 
 
@@ -70,11 +66,7 @@ class FitModel:
     common: Common = "nothing"
 
     def __post_init__(self):
-        """Refuse words that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words that mean nothing (`ValueError`)."""
         check_word("loss", self.loss, Loss)
         check_word("common", self.common, Common)
 
@@ -108,7 +100,6 @@ def values_of(model: FitModel, free, value) -> dict[str, Any]:
     """Every parameter of one trial in its unit, by name.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates; (F,).
         value: all parameters in their units, used where they are not free; (J,).
     """

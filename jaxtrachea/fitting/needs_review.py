@@ -32,12 +32,7 @@ _SITUATED = [
 
 
 def needs_review(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
-    """Unknowns of succeeded lanes that give cause, other than those that the structure leaves open.
-
-    Args:
-        result: of lanes fitted by themselves.
-        minima: where all starts ended.
-    """
+    """Unknowns of succeeded lanes that give cause, but those that the structure leaves open."""
     alive = np.isin(result.status, _SITUATED)
     present = np.asarray(result.study.lanes.active > 0)
     present = present & ~result.undetermined & alive[:, None]
@@ -57,14 +52,7 @@ def local_doubt(
     present: Bool[np.ndarray, "lanes P"],
     at_bound: Bool[np.ndarray, "lanes P"],
 ) -> Bool[np.ndarray, "lanes P"]:
-    """Unknowns that give cause by their errors at the estimate alone.
-
-    Args:
-        uncertainty: at the estimate.
-        natural: from `natural_sizes`.
-        present: unknowns that are asked about.
-        at_bound: unknowns on a bound.
-    """
+    """Unknowns that give cause by their errors at the estimate alone."""
     se = uncertainty.se / natural
     known = present & np.isfinite(se)
     se = np.where(known, se, 0)
@@ -150,7 +138,6 @@ def natural_sizes(
     coefficient k_n of the local law against that force over the depth to the power n.
 
     Args:
-        study: the study.
         relative: as `FitResult.relative`.
         first_touch: as `FitResult.first_touch`, mm.
     """

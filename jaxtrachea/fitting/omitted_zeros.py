@@ -86,7 +86,6 @@ def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
     fit asks for none: what one lane lacks its shared unknowns spread over the residuals of all.
 
     Args:
-        result: the fit.
         among: lanes that are looked at, in order.
     """
     able = _able(result)

@@ -30,8 +30,6 @@ def natural_steps(
     programs. Where records show one, over these alone: what fits take beyond does not change it.
 
     Args:
-        parameters: the table.
-        curves: of the study.
         recorded: what each curve takes by its own record; None: all.
         taken: what it takes at all, where no record shows one.
     """
@@ -102,8 +100,6 @@ def first_touches(
     The number at which it is held, or its estimate.
 
     Args:
-        lanes: all data.
-        parameters: the table.
         value: estimates in the parameters' units; None: the first guess in their place.
     """
     column = next(j for j, p in enumerate(parameters) if p.name == "onset")

@@ -135,13 +135,6 @@ def _softer(
     """Logarithm of the compliances on a grid of EI_L and k_M, over those of the estimates.
 
     Where nothing but these two resists, c(EI, k) = f(EI / k) / k: a line of EI / k tells the grid.
-
-    Args:
-        study: of the fit.
-        lanes: which.
-        best: their estimates.
-        beam: where the two stand among the unknowns of each.
-        axes: of each grid, as `_axes` gives them.
     """
     A = axes.shape[2]
     EI, k, step = axes[:, 0], axes[:, 1], axes[:, :, 1] - axes[:, :, 0]

@@ -62,11 +62,7 @@ class Parameter:
     foreign_value: float | None = dataclasses.field(default=None, compare=False)
 
     def __post_init__(self):
-        """Check that value, bounds and scale agree.
-
-        Raises:
-            InputError: naming the parameter and the cure.
-        """
+        """Check that value, bounds and scale agree (`InputError`)."""
         check_word(f"{self.name}: scale", self.scale, Scale)
         check_word(f"{self.name}: scope", self.scope, Scope)
         if not isinstance(self.fixed, bool):
@@ -180,8 +176,6 @@ def defaults_of(
     wall give for this tube (`from_wall`; of rings with pitches of their own the median).
 
     Args:
-        options: of the model.
-        geometry: the tube.
         wall: moduli and thicknesses; None: those of the paper and the virtual specimen.
         tool_radius: mm, which the local contact begins with; None: that of the virtual specimen's.
 

@@ -20,7 +20,6 @@ def predictions(
     """Residuals of all lanes at `theta` (lanes, P), in N and mm.
 
     Args:
-        study: the study.
         theta: scaled coordinates; (lanes, P).
         batch: lanes computed together, at most.
         like: lanes of a study whose program serves; None: as many as these.

@@ -61,7 +61,6 @@ def around_touch(study: Study, guess, low, high, decades: float):
     """The box of starts with onset and offset where the change point of each curve has them.
 
     Args:
-        study: the study.
         guess: first start, scaled coordinates; (lanes, P).
         low: lower end of the box; (lanes, P).
         high: (lanes, P).

@@ -86,8 +86,6 @@ def check_curve(curve: Curve, size: Size, options: Options, onset: float = 0.0) 
     """Refuse a curve that the model cannot press.
 
     Args:
-        curve: the curve.
-        size: of the tube.
         options: of the model.
         onset: displacement at first touch, mm: held there, or the first guess.
 
@@ -133,7 +131,6 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
     """Refuse a curve whose largest force is one that a tool which only touches cannot have.
 
     Args:
-        curve: the curve.
         options: with `unilateral` contact; other curves may pull.
         parameters: the table: a fitted onset may lie anywhere, a fitted offset shifts all forces.
 
@@ -168,10 +165,6 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
 
 def as_read(curves: Sequence[Curve], level: Level) -> tuple[Sequence[Curve], str | None]:
     """Curves as a level reads them: without vectors where it presses along the normal alone.
-
-    Args:
-        curves: that the level admits.
-        level: of the model.
 
     Returns:
         The curves without their vectors, and a sentence on what was left out; None: nothing was.
@@ -246,7 +239,6 @@ def too_deep_for_uniform(
 
     Args:
         curves: as recorded.
-        options: of the model.
         radius: of the tube, mm.
         touch: displacement of each curve at first touch, mm; None: 0.
     """
@@ -286,7 +278,6 @@ def deeper_than_validated(
 
     Args:
         curves: as recorded.
-        options: of the model.
         radius: of the tube, mm.
         touch: displacement of each curve at first touch, mm; None: 0.
         counted: see `onset.counted_from`.

@@ -65,11 +65,6 @@ def by_records(
     """The table with times within reach of the records, where the user has not said otherwise.
 
     Times of branches begin evenly in the logarithm of the time.
-
-    Args:
-        parameters: the table.
-        options: of the model.
-        span: of the records.
     """
     count = sum(name.startswith("tau") for name in LAWS[options.branches].names)
     ratio = span.longest / span.shortest
@@ -120,7 +115,6 @@ def relaxed_value(
     Of a skeleton that softens the force of small strain relaxes (`press_in_time`).
 
     Args:
-        model: what is fitted (static).
         values: every parameter of the trial by name.
         time: s.
         elastic: press.
@@ -143,7 +137,6 @@ def relaxed_press(
     """A press as its force relaxes, see `relaxed_value`, with its derivatives.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units.
         time: s.
@@ -211,7 +204,6 @@ def parts_press(
     """A press whose local law and skeleton relax apart, with its derivatives.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units.
         time: s.

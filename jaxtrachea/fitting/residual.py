@@ -75,9 +75,7 @@ def inputs(
     """What the curves of one lane see of its unknowns.
 
     Args:
-        model: what is fitted (static).
         theta: unknowns in scaled coordinates.
-        lane: the lane's arrays (no leading axis).
         geometry: the tube, may be traced; None: of the model.
 
     Raises:
@@ -104,9 +102,7 @@ def residual(
     """Residuals of one lane and their Jacobian, trial by trial.
 
     Args:
-        model: what is fitted (static).
         theta: unknowns in scaled coordinates.
-        lane: the lane's arrays (no leading axis).
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
@@ -328,6 +324,9 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
         return jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]
 
     by_onset = slope(contact.onset)
+    # Through what the free parameters act on the contact force: only these terms are computed.
+    moving = (p.name for p in model.free)
+    felt = {"compliance" if name in SKELETON else coefficient(name) or name for name in moving}
     d_inputs = {"compliance": _felt(model, d_skeleton), "onset": d_contact.onset}
     for record in (d_contact.law.coefficients(), _fields(d_contact.softening)):
         d_inputs.update(record)
@@ -335,8 +334,9 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
     def pushed(by):
         by = by | {"onset": by["displacement"] * by_onset}
         out = jnp.zeros((len(eye), *D.shape), D.dtype)
-        for name in (name for name in d_inputs if name in _felt_through(model)):
-            out = out + d_inputs[name][:, None] * by[name][None]
+        for name in d_inputs:
+            if name in felt:
+                out = out + d_inputs[name][:, None] * by[name][None]
         return out
 
     d_force = pushed(of_force)
@@ -406,7 +406,6 @@ def force_jacobian(
     Shape (Jf, N); where the motion has an angle, after it those of `names`.
 
     Args:
-        model: what is fitted (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
         motion: of the tool; its onset is that of the parameters.
@@ -428,9 +427,3 @@ def force_jacobian(
 
 def _fields(softening: Softening | None) -> dict[str, Array]:
     return {} if softening is None else softening._asdict()
-
-
-def _felt_through(model: FitModel) -> set[str]:
-    """Through what the free parameters act on the contact force: only these terms are computed."""
-    names = (p.name for p in model.free)
-    return {"compliance" if name in SKELETON else coefficient(name) or name for name in names}

@@ -46,11 +46,7 @@ class Settings:
     verify: bool = True
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self, starts=1.0, decades=0.0, seed=0.0, more_starts=0.0, batch=1.0)
         check_record(self.tolerances, cost=0.0, step=0.0, gradient=0.0, iterations=1.0)
 

@@ -34,7 +34,6 @@ def box(study: Study, decades: float) -> Box:
     """The guess of every lane and the box around it, inside the bounds.
 
     Args:
-        study: the study.
         decades: half the width of the box (scale `linear`: times 10 steps; onset and offset: times
             a tenth of the press, around the change point of the curve).
     """
@@ -77,7 +76,6 @@ def add_starts(
     Costs nothing where all starts are feasible and agree.
 
     Args:
-        study: the study.
         settings: of the fit; `more_starts` 0: all stays as it is.
         rows: lane of each start.
         solved: what they came to.

@@ -114,11 +114,7 @@ class Study:
     recipe: Recipe | None = dataclasses.field(default=None, init=False)
 
     def __post_init__(self):
-        """Refuse a model of another parameter table.
-
-        Raises:
-            ValueError: with the columns of both.
-        """
+        """Refuse a model of another parameter table (`ValueError`)."""
         if (of_table := columns_of(self.parameters)) != self.model.columns:
             raise ValueError(
                 f"the model has the columns {self.model.columns}, the parameter table gives "

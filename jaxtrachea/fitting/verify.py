@@ -96,10 +96,8 @@ def verify_minimum(
     """Look for other minima of the lanes in doubt and profile their unknowns.
 
     Args:
-        result: the fit.
         minima: where all starts ended.
         doubts: as `doubtful` gives them.
-        settings: of the fit.
         known: structure of the lanes.
         progress: called with (0, 0) as the work goes on.
         last: no better minimum will be followed: gather all evidence in any case.

@@ -84,12 +84,7 @@ def sentences(study: Study) -> list[str]:
 
 
 def asked_by_fits(study: Study, value: Float[np.ndarray, "lanes P"]) -> list[FittedZeros]:
-    """Curves that take an onset or a force offset which their fits ask for, with the estimates.
-
-    Args:
-        study: of the fit.
-        value: estimates, in the parameters' units.
-    """
+    """Curves that take an onset or a force offset which their fits ask for, with the estimates."""
     shown = study.record_zeros
     column = {p.name: j for j, p in enumerate(study.parameters) if p.auto and not p.fixed}
     out = []

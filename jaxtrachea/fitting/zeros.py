@@ -49,9 +49,6 @@ def resolved(
     """The table with its `auto` rows decided.
 
     Args:
-        parameters: the table.
-        curves: of the study.
-        options: of the model.
         sigma: given standard deviation of a force sample, N; a curve's own comes before it.
         asked: what curves take on top of what their records show (`omitted_zeros`).
         zeros: what the records show, as found before; None: they are looked at.

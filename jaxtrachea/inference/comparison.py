@@ -47,8 +47,6 @@ class Row:
         cost: of the fits, summed; with estimated noise each model has its own unit of it.
         deviance: -2 ln L, summed.
         AIC: summed over lanes, as are AICc and BIC.
-        AICc: -
-        BIC: -
         delta: AICc less the smallest of the models.
         weight: Akaike weight.
         left_out: rms force residual of what was left out, over the largest force of the lane; of
@@ -267,10 +265,6 @@ def sentence(rows: Sequence[Row], left: str = "positions") -> str:
     Decisive is a difference of AICc of `DECISIVE` or more that remains so for as many samples as
     are independent, that no prediction of what was left out contradicts, and where the best model
     follows the curves.
-
-    Args:
-        rows: of one specimen, one per model.
-        left: what was left out, in words.
     """
     best, second = sorted(rows, key=lambda row: row.AICc)[:2]
     if not np.isfinite(best.AICc):

@@ -199,7 +199,6 @@ def with_own_onset(
     Where the trials have none of their own, `theta` itself.
 
     Args:
-        study: the study, with all its data.
         held: trials, or samples of them, that took no part in the fit; some of each lane.
         theta: the fit without them, scaled coordinates.
         settings: of the fit; one that does not converge keeps its best point.
@@ -231,7 +230,6 @@ def refitted(
     which that fit has left behind (it followed up its doubts, a refit does not).
 
     Args:
-        study: the study, with all its data.
         held: trials left out, or samples of them; (lanes, T) or (lanes, T, N).
         estimate: of the lanes with all their data, scaled coordinates; NaN where there is none.
         settings: as for `fit`; no doubt is followed up.

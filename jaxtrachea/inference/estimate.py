@@ -52,7 +52,6 @@ def estimate(
     depend on it.
 
     Args:
-        model: of the fit.
         start: scaled coordinates, as `FitResult.theta`.
         lane: data, contact positions, bounds; see `lane_of`.
         sigma: of forces and markers, as `FitResult.whitened_sigma`.

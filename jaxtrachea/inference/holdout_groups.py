@@ -17,7 +17,6 @@ def with_holdout_groups(
     """The study with trials that no fit without one of them may see another of.
 
     Args:
-        study: the study.
         groups: names of trials; of each specimen those of a group are left out together.
         unusable: curves that are known, but not in the study.
 
@@ -64,12 +63,7 @@ def _ensure_trial(name: str, names: Sequence[str], key: str) -> None:
 
 
 def companions(curves: Sequence[Curve], holdout_groups: Sequence[Sequence[str]]) -> list[list[int]]:
-    """For each curve of a lane, all that are left out with it, itself among them.
-
-    Args:
-        curves: of a lane, of one specimen or several.
-        holdout_groups: groups of trials, see `with_holdout_groups`.
-    """
+    """For each curve of a lane, all that are left out with it, itself among them."""
     group = {name: i for i, names in enumerate(holdout_groups) for name in names}
     keys = [(c.specimen, group.get(c.trial, c.trial)) for c in curves]
     members: dict[tuple[str, str | int], list[int]] = {}

@@ -121,7 +121,6 @@ def diagnose(
     """Diagnostics of one lane at its estimate.
 
     Args:
-        model: what is fitted (static).
         theta: estimate, scaled coordinates.
         lane: the lane's arrays.
         sigma: as for `evaluate`.
@@ -228,7 +227,6 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
     """Diagnostics of all lanes of a fit.
 
     Args:
-        result: the fit.
         batch: lanes computed together; of a level that iterates no more than `PATHS`.
 
     Raises:

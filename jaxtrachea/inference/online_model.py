@@ -131,7 +131,6 @@ def places_of(study: Study, places: ArrayLike | None, depth: float) -> Candidate
     """Presses to choose the next one from.
 
     Args:
-        study: with the tube.
         places: mm; None: `PLACES`, from the first to the last ring.
         depth: of all of them, mm.
 

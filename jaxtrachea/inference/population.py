@@ -93,10 +93,6 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     bound, structurally non-identifiable or inconclusive an estimate has none. Parameters that fewer
     than three specimens determine (identifiable or weak) are left out.
 
-    Args:
-        result: the fit.
-        profiles: further profiles, for the verdicts.
-
     Raises:
         ValueError: no `FitResult` or `Profiles`, no parameter with the scope `specimen`, or none
             that three specimens determine; several specimens in a lane.

@@ -118,7 +118,6 @@ def log_density(
     """Log posterior on the real line, up to a constant.
 
     Args:
-        model: what is fitted (static).
         noise_sampled: whether sigma of forces and of markers is unknown.
         lane: the lane's arrays.
         sigma: as for `evaluate`; where it is unknown, what the drawn one is relative to.
@@ -214,10 +213,8 @@ def posterior(
     What a lane draws depends on the seed and its place alone.
 
     Args:
-        result: the fit.
         draws: of each chain, after 500 steps of warm-up; more where the chains are not good.
         chains: of each lane, 2 or more.
-        seed: of the drawing.
         batch: lanes computed together.
         progress: called with (lanes done since the last call, lanes in all).
 

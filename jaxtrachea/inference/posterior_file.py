@@ -17,10 +17,6 @@ def write_posterior(posterior: Posterior, path: Path) -> None:
     Group `posterior` has a variable for each unknown, in its unit, NaN where a specimen has no such
     unknown; `sample_stats` has `diverging`. Dimensions: chain, draw, specimen.
 
-    Args:
-        posterior: the draws.
-        path: of the new file.
-
     Raises:
         OSError: the file cannot be written.
     """

@@ -89,7 +89,8 @@ def around_the_fit(
     covariance = np.eye(Q) / max(2 * result.samples[lane], 1)
     covariance[:P, :P] = correlation * np.outer(deviation, deviation)
     centre = np.append(np.where(active, to_line(share, 0, 1), 0), np.zeros(Q - P))
-    return Start(centre, _root(covariance), _scattered(seed, lane, chains, Q))
+    scattered = np.random.default_rng([seed, lane]).normal(size=(chains, Q))
+    return Start(centre, _root(covariance), scattered)
 
 
 def _conditional(result: FitResult, lane: int, width: np.ndarray) -> np.ndarray:
@@ -117,7 +118,3 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     """A square root of a covariance, columns along its axes; none of length zero."""
     values, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.maximum(values, 1e-14 * np.max(values)))
-
-
-def _scattered(seed: int, lane: int, chains: int, size: int) -> Float[np.ndarray, "C Q"]:
-    return np.random.default_rng([seed, lane]).normal(size=(chains, size))

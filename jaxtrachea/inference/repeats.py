@@ -215,9 +215,6 @@ def leave_repeats_out(
         progress: as for `fit`.
         leave_out: see `repeats`.
 
-    Returns:
-        The `Missed` of all lanes.
-
     Raises:
         ValueError: no `FitResult` or `Settings`, or a word that is none.
     """

@@ -63,10 +63,6 @@ def combinations(
     this estimate: along a curved valley their exponents change. They are brought to echelon form,
     so that each has few factors and the first one the exponent 1.
 
-    Args:
-        names: of the unknowns.
-        null_space: undetermined directions, orthonormal.
-
     Returns:
         Names involved; products such as "EI_L k_M^3.02" (none if nothing is determined).
     """

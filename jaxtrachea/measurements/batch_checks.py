@@ -42,9 +42,6 @@ def finish_all(
     Args:
         records: curves as read, in mm, N, rad; what is bad already stays as it is.
         options: signs, loading rule, window and limits.
-
-    Returns:
-        For each record what `finish` makes of it.
     """
     done: list[Curve | BadCurve | None] = [None] * len(records)
     # Noise of the force is one of the displacement then; a whole record has its own way.

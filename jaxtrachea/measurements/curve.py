@@ -27,13 +27,7 @@ class Fault(Exception):
     """One curve cannot be used; becomes a `BadCurve`, or a `DataError` if it spoils the file."""
 
     def __init__(self, kind: str, message: str, cure: str) -> None:
-        """Say what is wrong.
-
-        Args:
-            kind: short code, see `BadCurve.kind`.
-            message: what was found where, and what was expected.
-            cure: what to do about it.
-        """
+        """Say what is wrong."""
         super().__init__(f"{message}; {cure}")
         self.kind, self.message, self.cure = kind, message, cure
 

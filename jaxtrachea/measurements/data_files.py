@@ -13,11 +13,13 @@ from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.names import appearance
 from jaxtrachea.measurements.read import (
+    WHOLE_FILE,
     BadCurve,
     Curve,
     DataError,
     Measurements,
     ReadOptions,
+    joined,
     read_measurements,
 )
 from jaxtrachea.measurements.readers import reader_of
@@ -29,10 +31,6 @@ _NAMES = 8
 
 def find_files(spec: FitSpec, root: Path) -> list[Path]:
     """Files of `data.files`, patterns expanded, sorted within each pattern.
-
-    Args:
-        spec: the specification.
-        root: folder that relative paths start from.
 
     Raises:
         SpecError: a path or pattern matches nothing.
@@ -48,10 +46,12 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
             ) from None
         files = [path for path in matches if path.is_file()]
         if not files:
-            raise SpecError(
-                f"data.files.{i}: {_short(pattern)} matches in {root} "
-                f"{_what(matches) if matches else _nothing(root / pattern)}"
-            )
+            what = "a device or a pipe; expected a file"
+            if not matches:
+                what = _nothing(root / pattern)
+            elif matches[0].is_dir():
+                what = "a folder; list the files in it, as in 'folder/*.csv'"
+            raise SpecError(f"data.files.{i}: {_short(pattern)} matches in {root} {what}")
         found.update(dict.fromkeys(files))
     return list(found)
 
@@ -59,13 +59,6 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
 def _short(pattern: str) -> str:
     """A pattern for a message."""
     return repr(pattern if len(pattern) < 200 else f"{pattern[:196]} ...")
-
-
-def _what(matches: list[Path]) -> str:
-    """What a pattern leads to that is no file, and the cure."""
-    if matches[0].is_dir():
-        return "a folder; list the files in it, as in 'folder/*.csv'"
-    return "a device or a pipe; expected a file"
 
 
 def _nothing(path: Path) -> str:
@@ -122,13 +115,7 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
         raise SpecError(f"data: {error}") from None
     if len(files) == 1:
         return _without(read_measurements(files, options), spec.data.exclude)
-    parts = [_read_one(path, options) for path in files]
-    curves = [curve for part in parts for curve in part.curves]
-    bad = [curve for part in parts for curve in part.bad]
-    notes = dict.fromkeys(note for part in parts for note in part.notes)
-    _refuse_twice(parts)
-    whole = Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
-    return _without(whole, spec.data.exclude)
+    return _without(joined([_read_one(path, options) for path in files]), spec.data.exclude)
 
 
 def _name(curve: Curve | BadCurve) -> str:
@@ -137,11 +124,7 @@ def _name(curve: Curve | BadCurve) -> str:
 
 
 def _without(whole: Measurements, exclude: Sequence[str]) -> Measurements:
-    """Without the curves that are excluded, usable or not; a note names them.
-
-    Raises:
-        SpecError: a name that no curve or more than one has, or that stands twice.
-    """
+    """Without the curves that are excluded, usable or not; a note names them."""
     if not exclude:
         return whole
     count = Counter(map(_name, (*whole.curves, *whole.bad)))
@@ -172,32 +155,8 @@ def _read_one(path: Path, options: ReadOptions) -> Measurements:
     try:
         return read_measurements([path], options.of_file(path))
     except DataError as error:
-        bad = BadCurve(
-            path.stem,
-            "(all)",
-            str(path),
-            "unreadable",
-            _own(error, path),
-            error.remedy or "repair the file or leave it out",
-        )
+        within = "" if error.place in ("", str(path)) else f"{error.place}: "
+        cure = error.remedy or "repair the file or leave it out"
+        problem = f"{within}{error.problem}"
+        bad = BadCurve(path.stem, WHOLE_FILE, str(path), "unreadable", problem, cure)
         return Measurements((), (bad,), (path,))
-
-
-def _own(error: DataError, path: Path) -> str:
-    """What is wrong, without the path; with the place in the file, if the error has one."""
-    return error.problem if error.place in ("", str(path)) else f"{error.place}: {error.problem}"
-
-
-def _refuse_twice(parts: list[Measurements]) -> None:
-    """Refuse a specimen and trial that two files hold."""
-    seen: dict[tuple[str, str], str] = {}
-    for part in parts:
-        for curve in (*part.curves, *(b for b in part.bad if b.trial != "(all)")):
-            key = (curve.specimen, curve.trial)
-            if key in seen:
-                raise DataError(
-                    f"specimen {key[0]!r} trial {key[1]!r} was already in {seen[key]}",
-                    place=curve.source,
-                    cure="rename one, or give a specimen pattern that tells files apart",
-                )
-            seen[key] = curve.source

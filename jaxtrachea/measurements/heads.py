@@ -65,13 +65,6 @@ class Head(NamedTuple):
 def head_of(path: Path, options: ReadOptions) -> Head:
     """The columns of a file; its rows are not read.
 
-    Args:
-        path: an existing file.
-        options: columns that are named, format, sheet.
-
-    Returns:
-        The head; of a table whose header is not found one without columns.
-
     Raises:
         DataError: it cannot be read, is damaged, hostile, or no data file at all.
     """

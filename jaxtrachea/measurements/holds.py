@@ -122,7 +122,7 @@ def holds(rise: Rise) -> tuple[int, tuple[Hold, ...], Hold | None]:
     for start, stop in _runs(slow, until):
         if envelope[start] <= envelope[0] + rise.band:
             last = _leaves(rise, envelope, start, stop, least)
-            if _lapse(rise, 0, last) >= short:
+            if rise.clock[last] - rise.clock[0] >= short:
                 rest = max(rest, last)
             continue
         first = _arrives(rise, envelope, start, stop, least)
@@ -154,11 +154,6 @@ def _durations(rise: Rise, envelope: np.ndarray) -> tuple[float, float]:
     whole = float(ends[1] - ends[0]) / float(_ALL[1] - _ALL[0])
     passing = SLOWER * rise.band / rise.height * usual
     return max(LEAST_HOLD * whole, passing), max(SHORT * whole, passing)
-
-
-def _lapse(rise: Rise, start: int, stop: int) -> float:
-    """Time between two samples, in the unit of the clock."""
-    return float(rise.clock[stop] - rise.clock[start])
 
 
 def _runs(slow: np.ndarray, until: np.ndarray) -> list[tuple[int, int]]:

@@ -15,12 +15,6 @@ def look_alikes(curves: Iterable[Curve | BadCurve]) -> list[str]:
     """One line for each group of names that look alike: specimens, then trials of a specimen.
 
     The names stay different. The cost is linear in the number of curves.
-
-    Args:
-        curves: usable or not.
-
-    Returns:
-        Lines with the names, in what they differ, how many curves each has, and the cure.
     """
     specimens: dict[str, dict[str, list[str]]] = {}
     trials: dict[tuple[str, str], dict[str, list[str]]] = {}

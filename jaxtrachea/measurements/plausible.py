@@ -20,9 +20,6 @@ def implausible_size(displacement: np.ndarray, force: np.ndarray) -> str | None:
     Args:
         displacement: (N,) mm.
         force: (N,) N.
-
-    Returns:
-        One sentence, or None.
     """
     return implausible_extent(float(np.ptp(displacement)), float(np.ptp(force)))
 

@@ -7,6 +7,7 @@ comes back as a `BadCurve` with its reason, and only what spoils a whole file or
 
 import dataclasses
 import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,8 @@ __all__ = [
     "write_hdf5",
 ]
 
+#: Trial of the row that stands for a file of which nothing can be read.
+WHOLE_FILE = "(all)"
 #: What another sheet of the same workbook may mend.
 _OF_THE_SHEET = ("empty", "column_missing")
 #: Names of columns in a sentence.
@@ -101,31 +104,43 @@ def read_measurements(
             f"paths is {paths!r}",
             cure="expected at least one file, by itself or in a list",
         )
-    files = tuple(Path(path) for path in paths)
-    curves: list[Curve] = []
-    bad: list[BadCurve] = []
-    notes: list[str] = []
+    files = [Path(path) for path in paths]
     check_machine_files(files, options)
+    return joined([_read(path, options) for path in files])
+
+
+def _read(path: Path, options: ReadOptions) -> Measurements:
+    """One file."""
+    _check_file(path)
+    records, said = _read_file(path, options)
+    done = finish_all(records, options.of_file(path))
+    curves = tuple(c for c in done if isinstance(c, Curve))
+    bad = tuple(c for c in done if isinstance(c, BadCurve))
+    return Measurements(curves, bad, (path,), (*said, *_notes(records)))
+
+
+def joined(parts: Sequence[Measurements]) -> Measurements:
+    """The curves of several files; what is said of several is said once.
+
+    Raises:
+        DataError: a (specimen, trial) comes twice.
+    """
     seen: dict[tuple[str, str], str] = {}
-    for path in files:
-        _check_file(path)
-        records, said = _read_file(path, options)
-        notes.extend([*said, *_notes(records)])
-        for record in records:
-            key = (record.specimen, record.trial)
+    for part in parts:
+        for curve in (*part.curves, *(b for b in part.bad if b.trial != WHOLE_FILE)):
+            key = (curve.specimen, curve.trial)
             if key in seen:
                 raise DataError(
                     f"specimen {key[0]!r} trial {key[1]!r} was already in {seen[key]}",
-                    place=record.source,
+                    place=curve.source,
                     cure="rename one, or give a specimen pattern that tells files apart",
                 )
-            seen[key] = record.source
-        for done in finish_all(records, options.of_file(path)):
-            if isinstance(done, BadCurve):
-                bad.append(done)
-            else:
-                curves.append(done)
-    return Measurements(tuple(curves), tuple(bad), files, tuple(notes))
+            seen[key] = curve.source
+    curves, bad, files, notes = (
+        tuple(itertools.chain.from_iterable(getattr(part, name) for part in parts))
+        for name in ("curves", "bad", "files", "notes")
+    )
+    return Measurements(curves, bad, files, tuple(dict.fromkeys(notes)))
 
 
 def write_hdf5(
@@ -140,8 +155,6 @@ def write_hdf5(
     The file is written beside its place and then moved there, so it is complete or absent.
 
     Args:
-        path: the file to write.
-        measurements: the curves.
         attrs: further root attributes, such as licence and source.
         overwrite: replace an existing file.
 
@@ -184,11 +197,7 @@ def _check_file(path: Path) -> None:
 
 
 def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
-    """What one file holds, and what should be said of it.
-
-    Raises:
-        DataError: as `read_measurements`.
-    """
+    """What one file holds, and what should be said of it."""
     asked = reader_of(options.format)
     head = first_bytes(path, HEAD)
     for reader in READERS if asked is None else (asked,):
@@ -223,11 +232,7 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
 def _read_workbook(
     path: Path, asked: Reader | None, options: ReadOptions
 ) -> tuple[Records, list[str]]:
-    """The curves of the sheets that are meant, and which sheet was read if nobody chose several.
-
-    Raises:
-        DataError: the workbook or the table of the sheet cannot be read.
-    """
+    """The curves of the sheets that are meant, and which sheet was read if nobody chose several."""
     texts, sheets = read_sheets(path, options.sheet)
     others = listed([name for name in sheets if name not in {text.sheet for text in texts}])
     hint = f", or choose another sheet with data.sheet ({others})" if others else ""

@@ -65,7 +65,6 @@ def faults(
         displacement: mm, of the record.
         force: N.
         keep: samples of the loading to look at; few of them find nothing.
-        found: segments of the record.
 
     Returns:
         Samples of `keep` after a break or on a flat top, and sentences.

@@ -104,9 +104,6 @@ def segment(
         time: s, never falling, or None.
         first: take the first full loading instead of the last.
 
-    Returns:
-        Segments of the record.
-
     Raises:
         NoLoading: the record only unloads.
     """
@@ -211,7 +208,6 @@ def _foot(travel: np.ndarray, points: list[int], corners: list[int], foot: int) 
     """Where a loading begins in air: its last return there, else the lowest place since.
 
     Args:
-        travel: the record.
         points: turning points of what counts of it.
         corners: its own turning points.
         foot: where what counts of the loading begins.

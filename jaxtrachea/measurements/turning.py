@@ -63,7 +63,6 @@ def turning_points(values: Float64[np.ndarray, " n"], tolerance: float) -> list[
     Minima and maxima alternate; of equal minima the last counts, of equal maxima the first.
 
     Args:
-        values: the record.
         tolerance: largest reversal that is none, in the unit of `values`.
 
     Returns:
@@ -100,10 +99,6 @@ def turning_points(values: Float64[np.ndarray, " n"], tolerance: float) -> list[
 def loadings(values: Float64[np.ndarray, " n"], points: list[int]) -> list[tuple[int, int]]:
     """Feet and peaks of the loadings between turning points, dips and partial returns within them.
 
-    Args:
-        values: the record.
-        points: its turning points.
-
     Returns:
         Pairs of samples (foot, peak) in order; none if the record only falls.
     """
@@ -121,15 +116,7 @@ def loadings(values: Float64[np.ndarray, " n"], points: list[int]) -> list[tuple
 
 
 def turned_back(values: Float64[np.ndarray, " n"], tolerance: float) -> Bool[np.ndarray, " n"]:
-    """Samples of a rising record from where it turns back until it is where it was.
-
-    Args:
-        values: the record, from foot to peak.
-        tolerance: largest reversal that is none.
-
-    Returns:
-        True where the tool is on its way back or up again.
-    """
+    """Samples of a rising record from where it turns back until it is where it was."""
     back = np.zeros(values.shape, dtype=bool)
     points = turning_points(values, tolerance)
     if len(points) > 1 and values[points[1]] < values[points[0]]:

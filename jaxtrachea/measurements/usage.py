@@ -73,12 +73,8 @@ def usage(
         displacement: (N,) mm, of the record.
         keep: (N,) samples of the curve.
         found: segments of the record; None: it only unloads.
-        loading: the loading rule.
         unit: of the duration of holds, ``"s"`` or ``"samples"``.
         faulty: samples left out after a break or on a flat top, and what is said of the record.
-
-    Returns:
-        Counts, segments, causes and remarks.
     """
     used = int(np.count_nonzero(keep))
     chosen = found is not None and loading in CHOOSING
@@ -144,7 +140,7 @@ def _mixed(found: Segments, unit: str, loading: str) -> Iterator[str]:
     others = []
     holds = (*found.steps, *(() if found.hold is None else (found.hold,)))
     if holds:
-        longest = max(holds, key=_duration)
+        longest = max(holds, key=lambda hold: hold.duration)
         others.append(f"a hold of {lasting(longest, unit)} ({_relaxing(holds)})")
     if found.loadings > 1:
         others.append(f"{found.loadings} loadings")
@@ -152,7 +148,3 @@ def _mixed(found: Segments, unit: str, loading: str) -> Iterator[str]:
         others.append("unloading")
     if others:
         yield f"every sample is used, with {' and '.join(others)}: an elastic fit mixes them"
-
-
-def _duration(hold: Hold) -> float:
-    return hold.duration

@@ -147,13 +147,7 @@ def _listed(curves: Sequence[Curve]) -> str:
 def usage_section(
     curves: Sequence[Curve], notes: Sequence[str] = (), more: Sequence[str] = ()
 ) -> list[str]:
-    """The section of the report, if there is anything to say.
-
-    Args:
-        curves: as they are used.
-        notes: what else should be known of how they were read, a sentence each.
-        more: further sentences on the curves.
-    """
+    """The section of the report, if there is anything to say."""
     said = [f"{text[:1].upper()}{text[1:]}" for text in (*sentences(curves), *more)]
     said += notes  # which may begin with the name of a file
     if not said:

@@ -101,7 +101,6 @@ def remarks_of(
     Args:
         time: s.
         displacement: mm, of the record.
-        found: its segments.
         whole: the record is used as it went.
     """
     speeds = {
@@ -173,11 +172,6 @@ def block_edges(found: Segments, size: int, most: int) -> Int[np.ndarray, " b"]:
 
     As many in each part of the record: even in ramps, whose ends stay as they are, and shorter at
     the beginning of a hold, where the force changes quickly.
-
-    Args:
-        found: segments of the record.
-        size: samples of the record that are used.
-        most: blocks.
     """
     parts = [(p.kind, p.start, min(p.stop, size)) for p in found.parts if p.start < size]
     share = max(most // len(parts), LEAST_BLOCKS)

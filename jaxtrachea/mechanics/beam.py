@@ -120,7 +120,6 @@ def _reach(
     A ring exactly at C belongs to side A.
 
     Args:
-        beam: the beam.
         s_c: mm.
         written_out: a comparison for each ring and no sum over them, which of many lanes no single
             kernel can make (`fusion.REDUCED`).
@@ -155,11 +154,7 @@ def _tip(side: Side, node: _Node) -> _Node:
 
 
 def _check_shapes(beam: Beam) -> None:
-    """Refuse a beam whose spans and supports do not fit each other.
-
-    Raises:
-        ValueError: which, its length and the expected one; no beam, or one without supports.
-    """
+    """Refuse a beam whose spans and supports do not fit each other."""
     check_word("beam", beam, Beam)
     n = shaped("Beam.x", beam.x, ("any number of",)).shape[0]
     if n == 0:

@@ -96,9 +96,7 @@ def gradient(
     """Of a solved press straight in, by the envelope theorem.
 
     Args:
-        geometry: the tube at rest.
         material: values that are not negative.
-        solved: the press.
         options: that it was solved with.
         rings: likewise.
         axial: likewise.

@@ -62,7 +62,6 @@ def press_softening(
         displacement: D after first touch, mm; any shape.
         compliance: c of the skeleton at small strain, mm/N, not negative.
         law: local law; k_1 > 0.
-        softening: of the press.
     """
     e_1, e_2 = (jnp.asarray(e, displacement.dtype) for e in softening)
     displacement, e_1, e_2 = jnp.broadcast_arrays(displacement, e_1, e_2)

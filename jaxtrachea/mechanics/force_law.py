@@ -137,6 +137,10 @@ class Law(NamedTuple):
         delta, terms = _scaled(self, displacement, compliance, share)
         return delta * (cubic_ratio(*terms) if len(terms) == 1 else quintic_ratio(*terms))
 
+    def under(self, force: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Indentation that the law by itself has under a force, mm; NaN past the fold."""
+        return self.root(force, jnp.ones_like(force), 0.0)
+
     def _folded(self, displacement, compliance) -> Bool[Array, "..."]:
         terms = _scaled(self, displacement, compliance, 1)[1]
         if len(terms) == 1:

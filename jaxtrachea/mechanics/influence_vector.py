@@ -95,7 +95,6 @@ def influence_vector(
     are the mean of both sides) and where they are `STRIP` apart.
 
     Args:
-        geometry: the tube at rest.
         material: k_M, EI_L; `shear` needs GA_L, `arch2` EI_C and k_t, `axial` EA_L.
         s: positions of the contacts, mm, in [0, length], in any order; two may be equal.
         phi: their angles, rad, in [-alpha, alpha]; likewise.

@@ -97,11 +97,7 @@ class ObliqueOptions:
     axial: bool = True
 
     def __post_init__(self):
-        """Refuse words that mean nothing, and options of normal presses alone.
-
-        Raises:
-            ValueError: naming the option, what was found and what is expected.
-        """
+        """Refuse words that mean nothing, and options of normal presses alone (`ValueError`)."""
         check_record(self)
         _only_default(self.press)
 
@@ -232,13 +228,8 @@ def press_path(
 
     Args:
         geometry: as for `press_oblique`, like all that is not named here.
-        material: -
-        s_c: -
-        phi_c: -
         displacement: of the tool at the end of each step, from rest, mm; (steps, 3).
         friction: between tool and surface.
-        options: -
-        onset: -
 
     Returns:
         The `ObliquePath`; OFF_TUBE, BAD_MATERIAL (also: a negative mu) and NON_FINITE where it is
@@ -372,10 +363,8 @@ def assemble(unit: Skeleton, force, depth, status, load=None) -> ObliquePress:
     """The skeleton's response times the forces; the ring's status where it has one.
 
     Args:
-        unit: -
         force: of the contact, which the rings bear.
         depth: local indentation.
-        status: -
         load: elastic force that the shape follows; None: the force.
     """
     load = force if load is None else load

@@ -303,13 +303,20 @@ def _press(
     law = local_law(geometry, material, s_c, options)
     contact = Contact(law, onset, blend, softening_of(material, options))
     solved = respond(displacement, unit.w_C, contact, options)
+    status = mark_deep(solved.status, displacement - onset, geometry.radius)
+    return pressed(unit, solved, status, refused)
+
+
+def pressed(
+    unit: punch.UnitDeflection, solved: equilibrium.Equilibrium, status: Int[Array, "*n"], refused
+) -> Press:
+    """The press where the contact is in equilibrium; NaN where it is refused."""
     unit, solved = mask(refused, unit, solved)
 
     def per_ring(factor, v):
-        return scaled(factor[..., None], jnp.broadcast_to(v, (*displacement.shape, *v.shape)))
+        return scaled(factor[..., None], jnp.broadcast_to(v, (*factor.shape, *v.shape)))
 
     load = solved.force if solved.load is None else solved.load
-    status = mark_deep(solved.status, displacement - onset, geometry.radius)
     return Press(
         force=solved.force,
         depth=solved.depth,

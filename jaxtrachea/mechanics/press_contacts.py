@@ -136,11 +136,7 @@ def checked_contacts(
 
 
 def _truths(name: str, given: ArrayLike, m: int) -> Bool[Array, " m"]:
-    """One truth value of each contact.
-
-    Raises:
-        ValueError: something else.
-    """
+    """One truth value of each contact."""
     given = jnp.asarray(given)
     if given.dtype != bool or given.shape not in ((), (m,)):
         raise ValueError(

@@ -167,8 +167,6 @@ def places_of(geometry: Geometry, material: Material, s_c, phi_c, present, used:
     """Places and material to compute with, and the refusal of all contacts, or OK.
 
     Args:
-        geometry: -
-        material: -
         s_c: positions, mm; shape (m,).
         phi_c: angles, rad.
         present: which contacts are there.

@@ -68,7 +68,6 @@ def at_rest(relaxation: Relaxation, options: Options, vector: bool) -> History:
     """Before the first press, in the dtype of the branches.
 
     Args:
-        relaxation: the branches.
         options: whether parts relax apart (static).
         vector: whether presses are vectors (static).
     """
@@ -191,10 +190,7 @@ def _alike(elastic, depth, law: Law, way, status, options: Options, samples: Sam
     Args:
         elastic: elastic force, N; a vector has its inward component first.
         depth: elastic indentation, mm.
-        law: local law.
         way: displacement under an elastic force, mm.
-        status: of the elastic press.
-        options: static.
         samples: times and history.
     """
     unilateral, branches = options.contact == "unilateral", samples.relaxation.local
@@ -302,9 +298,9 @@ def _row(force, depth, load, work, status, lost, skipped, unilateral: bool):
 def _alone(law: Law, elastic):
     """Indentation of the local law under an elastic force, mm; a vector goes along it."""
     if elastic.shape[-1:] != (3,):
-        return law.root(elastic, jnp.ones_like(elastic), 0.0)
+        return law.under(elastic)
     squared = jnp.sum(elastic * elastic, axis=-1, keepdims=True)
     some = squared > 0
     size = jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1)), 0)
-    per_size = jnp.where(some, law.root(size, jnp.ones_like(size), 0.0), 0)
+    per_size = jnp.where(some, law.under(size), 0)
     return per_size / jnp.where(some, size, 1) * elastic

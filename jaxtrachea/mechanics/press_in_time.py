@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._arguments import real, shaped
-from jaxtrachea._numerics import scaled
 from jaxtrachea.mechanics import press as _press
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.force_law import Law
@@ -20,8 +19,6 @@ from jaxtrachea.mechanics.validation import (
     check_place,
     float_type,
     mark_deep,
-    mask,
-    status_of,
     validate,
 )
 from jaxtrachea.relaxation.filter import Relaxation, relax
@@ -129,21 +126,7 @@ def _press_in_time(
         way = way_of(solved.load, unit.w_C, law) if apart else moved
         solved, status = softened(solved, status, softening, way)
     status = mark_deep(status, displacement - onset, geometry.radius)
-    unit, solved = mask(refused, unit, solved)
-    load = solved.load
-
-    def per_ring(factor, v):
-        return scaled(factor[:, None], jnp.broadcast_to(v, (*factor.shape, *v.shape)))
-
-    return Press(
-        force=solved.force,
-        depth=solved.depth,
-        skeleton=scaled(load, jnp.broadcast_to(unit.w_C, load.shape)),
-        joints=per_ring(load, unit.w),
-        reactions=per_ring(solved.force, unit.reaction),
-        compliance=unit.w_C,
-        status=status_of(refused, status),
-    )
+    return _press.pressed(unit, solved, status, refused)
 
 
 def softened(solved: Equilibrium, status, softening: Softening, way):
@@ -191,7 +174,7 @@ def _in_time(
         depth = moved - compliance * surface
         if unilateral:
             left = surface != load
-            alone = law.root(jnp.where(left, surface, 0), jnp.ones_like(surface), 0.0)
+            alone = law.under(jnp.where(left, surface, 0))
             depth = jnp.where(left, alone, depth)
     else:
         branches = relaxation.local, relaxation.skeleton

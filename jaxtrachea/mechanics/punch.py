@@ -58,7 +58,6 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     float32 some hundredth of a span).
 
     Args:
-        beam: the beam and its supports.
         s_c: middle of the punch, mm; half a width off both ends.
         half_width: mm, more than 0.
     """

@@ -59,14 +59,11 @@ def energy(
         compliance: of the skeleton, mm/N.
     """
 
-    def depth(e):
-        return law.root(e, jnp.ones_like(e), 0.0)
-
     def moved(e):
-        return depth(e) + compliance * e
+        return law.under(e) + compliance * e
 
     def complementary(e):
-        d = depth(e)
+        d = law.under(e)
         return e * d - law.energy(d * d) + compliance * e * e / 2
 
     gamma = branches.gamma[None]

@@ -102,7 +102,6 @@ def relax_parts_with_derivatives(
         time: s; as in `relax_parts`, with the next three.
         displacement: mm.
         compliance: mm/N.
-        law: local law.
         branches: of the local law and of the skeleton.
         along: directions of the derivatives.
         unilateral: as in `relax_parts` (static).
@@ -126,7 +125,7 @@ def way_of(load: Float[Array, " N"], compliance: Float[Array, ""], law: Law) -> 
     Of parts that relax alike it is the way of the tool. Where they relax apart the skeleton is
     deflected more or less than that says, and with it the shape that softens.
     """
-    return compliance * load + law.root(load, jnp.ones_like(load), 0.0)
+    return compliance * load + law.under(load)
 
 
 def _loop(local, skeleton, displacement, compliance, law: Law, unilateral: bool = True):
@@ -136,9 +135,6 @@ def _loop(local, skeleton, displacement, compliance, law: Law, unilateral: bool 
         local: x, lost and gamma of the local law, see `relaxation.steps`.
         skeleton: those of the skeleton.
         displacement: (N, *lanes).
-        compliance: of the skeleton.
-        law: local law.
-        unilateral: static.
     """
     (x, lost, gamma), (x_s, lost_s, gamma_s) = local, skeleton
 
@@ -160,9 +156,6 @@ def one_sample(before, fading, displacement, compliance, law: Law, unilateral: b
             skeleton, N.
         fading: `factors` of the local law, and of the skeleton.
         displacement: after first touch, mm.
-        compliance: of the skeleton.
-        law: local law.
-        unilateral: static.
     """
     h, e, q, y = before
     (kept, _, share), (kept_s, _, share_s) = fading
@@ -174,7 +167,7 @@ def one_sample(before, fading, displacement, compliance, law: Law, unilateral: b
         left = force < 0
         alone = jnp.where(left, -B / A, 0)
         force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
-        depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0.0), depth)
+        depth = jnp.where(left, law.under(alone), depth)
     load = (force - B_s) / A_s
     h = tuple(E * h + P * (new - e) for E, P, h in zip(kept, share, h, strict=True))
     q = tuple(E * q + P * (load - y) for E, P, q in zip(kept_s, share_s, q, strict=True))
@@ -241,13 +234,9 @@ def _loop_with_derivatives(
 
     Args:
         local: see `_loop`, with the next four.
-        skeleton: of the skeleton.
         displacement: (N, *lanes).
-        compliance: of the skeleton.
-        law: local law.
         along: changes, of gamma and of log tau each (B, K, *lanes), of the displacement
             (N, K, *lanes), of compliance and coefficients (K, *lanes).
-        unilateral: static.
     """
     (x, lost, gamma), (x_s, lost_s, gamma_s) = local, skeleton
     barrier = jax.lax.optimization_barrier
@@ -268,7 +257,7 @@ def _loop_with_derivatives(
         if unilateral:
             alone = jnp.where(left, -B / A, 0)
             force, new = jnp.where(left, 0, force), jnp.where(left, alone, new)
-            depth = jnp.where(left, law.root(alone, jnp.ones_like(alone), 0.0), depth)
+            depth = jnp.where(left, law.under(alone), depth)
         load, slope = (force - B_s) * per, law.tangent(depth)
         powers = [*law.powers(depth).values()]
         force, new, load, slope, left, powers = barrier((force, new, load, slope, left, powers))

@@ -5,7 +5,7 @@ side. Its ends U (phi = -alpha) and V (+alpha) each stand on springs k_M / 2 in 
 joined behind by the muscular bar, a tie k_t. Three levels of detail:
 
 - `mat`: the ring is rigid and moves on the mat alone, k = k_M (the paper: d_i = P_i / k);
-- `arch`: the stiffness 1 / (e^T C e) in one direction e, `support_stiffness`;
+- `arch`: the stiffness 1 / (e^T C e) in one direction e;
 - `arch2`: the compliance C for both components of a load, `ring_compliance`.
 
 The paper names the arch and the tie but prints no equations for them; these are the unit-load
@@ -18,19 +18,16 @@ differ, k_M say: what depends on the angle alone is then computed once.
 Units: mm, N, N mm^2, N/mm, mm/N, rad.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.mechanics._matrix2 import apply
 from jaxtrachea.status import RingStatus
-
-Level = Literal["mat", "arch"]
 
 
 class Ring(eqx.Module):
@@ -169,7 +166,6 @@ def ring_compliance(
     """Level `arch2`: displacement of the ring at phi_c per unit load (P_y, P_z) there.
 
     Args:
-        ring: section and supports.
         phi_c: angle of the load from the anterior midline, rad, in (-pi, pi].
         order: Gauss-Legendre points on each side of the load. For alpha = 2 pi / 3: 4 leave 1e-3,
             6 leave 2e-6, 8 leave 1e-9, 12 rounding.
@@ -187,39 +183,6 @@ def ring_compliance(
     return C, _status(phi_c, on, jnp.all(jnp.isfinite(C)))
 
 
-def support_stiffness(
-    ring: Ring,
-    phi_c: Float[Array, ""],
-    direction: Float[Array, "2"],
-    *,
-    level: Level = "arch",
-    order: int = 12,
-) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Stiffness of the ring as the support of a beam that bends in one plane.
-
-    Args:
-        ring: section and supports.
-        phi_c: angle of the joint, rad, in (-pi, pi].
-        direction: (y, z) of the load, of any length but 0; a normal press at phi_c has
-            (cos phi_c, sin phi_c).
-        level: `mat` (the paper: k_M at every angle) or `arch` (1 / (e^T C e)).
-        order: as in `ring_compliance`.
-
-    Returns:
-        Stiffness, N/mm, and a `RingStatus`. `arch` gives NaN behind the ring's ends.
-    """
-    check_word("level", level, Level)
-    if level == "mat":
-        return ring.k_M, jnp.zeros((), jnp.int8)
-    C, status = ring_compliance(ring, phi_c, order=order)
-    behind = status == RingStatus.BEHIND_GAP
-    C = jnp.where(
-        behind, jnp.eye(2, dtype=C.dtype), C
-    )  # before the division: a NaN there would enter the derivatives
-    k = jnp.sum(direction**2) / jnp.sum(direction * apply(C, direction))
-    return jnp.where(behind, jnp.nan, k), status
-
-
 def respond(
     ring: Ring, phi_c: Float[Array, ""], load: Float[Array, "2"], *, order: int = 12
 ) -> RingResponse:
@@ -229,7 +192,6 @@ def respond(
     move by P_z / k_M and apart by `opening`. The spring of end U carries k_M / 2 * end_U.
 
     Args:
-        ring: section and supports.
         phi_c: angle of the load, rad, in (-pi, pi].
         load: (P_y, P_z), N.
         order: as in `ring_compliance`.
@@ -269,7 +231,6 @@ def ring_influence(
     the motion of U and V. Reciprocal: the influence of phi on phi_c is its transpose.
 
     Args:
-        ring: section and supports.
         phi: angle of the observed point, rad, in [-alpha, alpha].
         phi_c: angle of the load, rad, in [-alpha, alpha].
         order: Gauss-Legendre points on each of three pieces, see `ring_compliance`.

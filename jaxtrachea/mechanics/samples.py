@@ -35,13 +35,7 @@ def as_before(v: Float[Array, " N"], skipped: Bool[Array, " N"]) -> Float[Array,
 def no_history(
     status: Int[Array, " N"], skipped: Bool[Array, " N"], folded: Bool[Array, " N"] | None = None
 ) -> tuple[Bool[Array, " N"], Int[Array, " N"]]:
-    """From the first sample without a solution on: which those are, and its status in all of them.
-
-    Args:
-        status: of the elastic press.
-        skipped: samples that do not count.
-        folded: further samples without a solution: PAST_FOLD.
-    """
+    """From the first sample without a solution on: which those are, all with its status."""
     failed = ~has_solution(status)
     if folded is not None:
         status = jnp.where(folded & ~failed, PressStatus.PAST_FOLD, status)

@@ -47,7 +47,6 @@ def validate(
     """Check what a press is asked.
 
     Args:
-        geometry: the tube at rest.
         material: its shapes are checked, all of them.
         s_c: contact position, mm.
         used: names of the values of the material that the model reads and that must not be
@@ -171,10 +170,6 @@ def mask(refused: Int[Array, ""], *arrays: Any) -> Any:
 
     Where products of several of these are returned, hiding the factors is enough, and cheaper:
     `where` passes no derivative, not even NaN, to what it hides.
-
-    Args:
-        refused: from `validate`.
-        arrays: arrays and trees of arrays; what is not floating stays.
 
     Returns:
         The same, one for each argument (of one argument: itself).

@@ -97,7 +97,6 @@ def levenberg_marquardt(
         batch: starts computed together at most; one alone takes a place among a few, unless this
             is 1, since compiling for another size takes longer.
         progress: called with the number of starts that finished since the last call.
-        dtype: of the computation.
         unoptimised: the program is compiled without optimisation (see `program`).
 
     Returns:

@@ -46,7 +46,6 @@ def respond(
     """The fitted model at one position: response and `PressStatus`; pure.
 
     Args:
-        model: of the fit (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
         motion: of the tool; its onset is that of the parameters. Where the force relaxes it has
@@ -98,7 +97,6 @@ def predicted(
     """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
 
     Args:
-        model: of the fit (static).
         estimate: with its uncertainty.
         motion: see `respond`; of one displacement at least.
         slack: where the fit has pressed, how far it sees slopes: its least ratio of singular values

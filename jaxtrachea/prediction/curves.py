@@ -146,7 +146,6 @@ def predict_sources(
     """Predictions for many curves in one program.
 
     Args:
-        stored: the fit.
         sources: with which parameters each curve is predicted.
         s: contact position of each, mm; NaN without one.
         displacements: of each, mm.

@@ -114,7 +114,6 @@ def compare(
     was fitted, its corner is rounded as the fit does it.
 
     Args:
-        stored: the fit.
         curves: from `pressable`.
         as_specimen: of the fit, in the place of one that it does not know.
     """
@@ -146,15 +145,10 @@ def compare(
     if stored.study.model.level.off_midline:
         aside = [(c.phi_c, (c.direction[0], c.direction[1])) for c in curves]
     depths = [c.displacement for c in curves]
-    times = [_time_of(c) for c in curves] if stored.study.model.relaxes else None
+    times = [np.asarray(c.time) for c in curves] if stored.study.model.relaxes else None
     found = predict_sources(stored, sources, s, depths, sigmas, aside=aside, times=times)
     offsets = [value_of(stored, source, "force_offset") for source in sources]
     return [Compared(*row) for row in zip(curves, found, words, offsets, strict=True)]
-
-
-def _time_of(curve: Curve) -> np.ndarray:
-    assert curve.time is not None  # else it is not `pressable`
-    return np.asarray(curve.time)
 
 
 def _with_zeros(stored: FitResult, curves: Sequence[Curve]) -> tuple[FitResult, Taken]:
@@ -242,7 +236,6 @@ def measured_corners(
     """Rounded corner at the onset of new curves, mm, as the fit has its own; NaN without an onset.
 
     Args:
-        stored: the fit.
         curves: new ones, alone or of any specimen.
         sigmas: noise of their samples; counts where that of the fit was given.
     """

@@ -27,11 +27,7 @@ def draw_predictions(folder: Path, curves: Sequence[CurvePrediction]) -> dict[st
 
 
 def draw_compared(folder: Path, compared: Sequence[Compared]) -> dict[str, str]:
-    """Write curves.png and measured_predicted.png.
-
-    Returns:
-        As `draw_predictions`.
-    """
+    """Write curves.png and measured_predicted.png."""
     pairs = [(c.prediction, c.curve.force) for c in compared]
     drawings = {
         "curves.png": partial(_panels, pairs),

@@ -8,9 +8,7 @@ from jaxtyping import ArrayLike
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.prediction.curves import CurvePrediction, predict_sources
 from jaxtrachea.prediction.pressed import pressed
-from jaxtrachea.prediction.sources import (
-    source_of,
-)
+from jaxtrachea.prediction.sources import source_of
 
 
 def predict(
@@ -74,11 +72,7 @@ def predict(
 
 
 def _times(time: ArrayLike | Sequence[float], displacement: np.ndarray) -> np.ndarray:
-    """Times as a vector.
-
-    Raises:
-        ValueError: not one for each displacement, one that is not finite, or that falls.
-    """
+    """Times as a vector."""
     t = np.atleast_1d(np.asarray(time, np.float64))
     if t.shape != displacement.shape:
         raise ValueError(

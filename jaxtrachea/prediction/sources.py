@@ -64,7 +64,6 @@ def source_of(
     """The parameters to predict a curve with.
 
     Args:
-        stored: the fit.
         specimen: of the curve.
         trial: of the fit whose own parameters count, and whose displacement and force; None: a new
             curve.

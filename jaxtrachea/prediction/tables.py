@@ -38,12 +38,7 @@ def _place(p: CurvePrediction, i: int) -> Row:
 
 
 def prediction_rows(p: CurvePrediction, curve: Curve | None = None) -> Iterator[Row]:
-    """One row per displacement; the band is that of a new sample.
-
-    Args:
-        p: the prediction.
-        curve: as measured, if it was.
-    """
+    """One row per displacement; the band is that of a new sample."""
     low, high = p.low95, p.high95
     for i in range(len(p.displacement)):
         force = np.nan if curve is None else float(curve.force[i])
@@ -99,7 +94,6 @@ def joint_rows(
     """One row per displacement of `at` and ring: deflection and reaction with their bands.
 
     Args:
-        p: the prediction.
         rings: ring positions, mm.
         at: which displacements.
         measured: marker displacement, mm, NaN where there was none; (N, rings).

@@ -166,7 +166,6 @@ def _loop(x, lost, elastic, gamma, unilateral: bool = True):
         lost: what a step takes of a branch.
         elastic: (N, *lanes).
         gamma: (B, *lanes).
-        unilateral: static.
     """
 
     def step(state, sample):
@@ -219,9 +218,7 @@ def loop_with_derivatives(
         lost: what a step takes of a branch.
         elastic: N.
         columns: derivatives of the elastic force; (N, C, *lanes).
-        gamma: of the branches.
         along: changes of gamma and of log tau, each (B, K, *lanes); None: of their logarithms.
-        unilateral: static.
         surface: whether derivatives of the surface's elastic force are asked for (static).
 
     Returns:

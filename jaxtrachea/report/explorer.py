@@ -58,13 +58,7 @@ The columns of the table are these changes, in standard errors of independent re
 
 
 def explorer(found: Influence, command: str, excluded: Sequence[str] = ()) -> str:
-    """The section of report.html; "" where no fit has two curves that can do without each other.
-
-    Args:
-        found: of a fit.
-        command: that makes the fit again.
-        excluded: curves that `data.exclude` names already.
-    """
+    """The section of report.html; "" where no fit has two curves that can do without each other."""
     result = found.result
     lanes = [
         k for k in worst_first(result) if succeeded(result, k) and len(result.study.curves[k]) > 1

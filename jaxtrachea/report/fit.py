@@ -29,15 +29,7 @@ def report_text(
     data: Sequence[str] = (),
     understood: Sequence[str] = (),
 ) -> str:
-    """The whole report.md.
-
-    Args:
-        title: of the report.
-        findings: the fit, and what its analyses have found.
-        bad: curves that could not be used.
-        data: paragraphs on what is used of the data.
-        understood: lines on tube, model and onset (`understood.understood`).
-    """
+    """The whole report.md."""
     result = findings.result
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
     parts = [

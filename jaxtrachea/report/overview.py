@@ -12,11 +12,7 @@ from jaxtrachea.trials.repeats import trial_sentences
 
 
 def overview(findings: AnalysisResults) -> Iterator[Table | str]:
-    """Tables and sentences of a run, in the order in which they are shown.
-
-    Args:
-        findings: the fit, and what its analyses have found.
-    """
+    """Tables and sentences of a run, in the order in which they are shown."""
     result, profiles = findings.result, findings.profiles
     lanes = listed(result)
     cut = result.lanes > len(lanes)

@@ -32,11 +32,6 @@ def draw_all(
 ) -> tuple[list[Path], dict[str, str]]:
     """Write the pictures of `captions`, and those of the analyses.
 
-    Args:
-        folder: where to.
-        findings: the fit, and what its analyses have found.
-        ending: of the files: `png` or `svg`.
-
     Returns:
         The paths; and by file name, why a picture could not be drawn: it costs itself only.
     """

@@ -25,13 +25,7 @@ _CURE = "give [trachea] length and rings, or preset = 'table-1' if this is the t
 
 
 def understood(spec: FitSpec, study: Study, result: FitResult | None = None) -> list[str]:
-    """The lines that `check`, the terminal and the report show.
-
-    Args:
-        spec: as it was read.
-        study: as it was built from it.
-        result: of its fit, where there is one.
-    """
+    """The lines that `check`, the terminal and the report show."""
     missed = 0 if result is None or not study.free else int(result.effective.misses.sum())
     options = study.model.options
     curves = [c for lane in study.curves for c in lane]
@@ -68,15 +62,7 @@ def tube_line(
     curves: Sequence[Curve],
     missed: int = 0,
 ) -> str:
-    """The tube, and what contradicts it, where a warning stands first.
-
-    Args:
-        spec: as it was read.
-        geometry: the tube.
-        options: of the model.
-        curves: all.
-        missed: specimens whose curves the model misses.
-    """
+    """The tube, and what contradicts it, where a warning stands first."""
     if options.coupling == "total":
         return "Tube: none, the local law takes all (coupling = 'total')"
     x = np.asarray(geometry.ring_positions, float)

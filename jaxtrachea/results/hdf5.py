@@ -31,7 +31,6 @@ def write_hdf5(
     """Write all numbers of a fit; the schema is described in docs/results.md.
 
     Args:
-        path: new file.
         findings: the fit, and what its analyses have found: a group each.
         provenance: stored as JSON in the root attribute of that name.
         reading: how the data were read (the [data] section), for `predict`.

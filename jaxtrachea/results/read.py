@@ -234,11 +234,7 @@ def _pair(found: Any) -> tuple[float, float] | None:
 
 
 def _check_shapes(study: Study, place: _Places) -> None:
-    """Refuse arrays that do not belong together.
-
-    Raises:
-        ValueError: naming the array.
-    """
+    """Refuse arrays that do not belong together."""
     lanes, (L, T, N), J = study.lanes, place.shape, len(study.parameters)
     P = lanes.lower.shape[-1]
     if len(study.unknowns) != L or max(map(len, study.unknowns), default=0) > P:

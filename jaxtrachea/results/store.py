@@ -38,7 +38,6 @@ def write(
 
     Args:
         file: open for writing.
-        result: the fit.
         files: SHA-256 by file name.
         reading: the [data] section.
     """

@@ -63,8 +63,6 @@ def fit_shards(
     """Fit shards and save each as soon as it is done, a thread for each device.
 
     Args:
-        run: where to.
-        study: the whole study.
         settings: of the run, as `settings_for` gives them.
         todo: shards, as `missing` gives them.
         progress: as for `fit.fit`, called by one thread at a time; what it raises ends the work.

@@ -43,9 +43,6 @@ class Lost(Exception):
 def connected(address: str) -> Iterator[Any]:
     """A cluster with at least one worker.
 
-    Args:
-        address: of the scheduler, HOST:PORT.
-
     Raises:
         NoCluster: dask is not installed, nothing answers, or there is no worker.
     """
@@ -82,12 +79,9 @@ def fit_shards(
     """Fit shards on a cluster and save each as soon as it is there.
 
     Args:
-        run: where to.
-        study: the whole study.
         settings: of the run, as `checkpoint.settings_for` gives them.
         todo: shards, as `checkpoint.missing` gives them.
         progress: as for `fit.fit`; what it raises ends the work.
-        client: of the cluster.
         prepare: called in a worker before it fits.
 
     Raises:

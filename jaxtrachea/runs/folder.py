@@ -117,7 +117,6 @@ def go_on(target: Path, now: Manifest, *, force: bool = False) -> RunFolder:
     """The unfinished run in `target`.
 
     Args:
-        target: its folder.
         now: what would be run now.
         force: go on even if something has changed that decides the numbers.
 
@@ -182,11 +181,7 @@ def _reason(error: Exception) -> str:
 
 
 def _passed(target: Path, was: Manifest, now: Manifest, force: bool) -> list[str]:
-    """What differs, where the user forces it or has before.
-
-    Raises:
-        NoRun: something differs, and must not.
-    """
+    """What differs, where the user forces it or has before."""
     changed = [line for line in manifests.differences(was, now) if line not in was.forced]
     if was.lanes != now.lanes:
         raise NoRun(

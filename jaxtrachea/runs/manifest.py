@@ -6,9 +6,12 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args, get_origin, get_type_hints
+from typing import Annotated
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 import jaxtrachea
 from jaxtrachea.files.atomic import write_whole
@@ -18,11 +21,11 @@ SCHEMA = "jaxtrachea-run"
 SCHEMA_VERSION = 1
 _PACKAGES = ("jax", "jaxlib", "numpy", "scipy")
 _SOURCE = "the source of jaxtrachea"
-#: Keys on file of the fields that are called otherwise there.
-_RUN_KEYS, _RERUN_KEYS = {"batch": "chunk"}, {"results": "former"}
+#: Strict types; fields may be called otherwise on file.
+_STORED = ConfigDict(strict=True, extra="forbid", populate_by_name=True)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=_STORED)
 class Rerun:
     """Fitting the failed lanes of a finished run again.
 
@@ -32,12 +35,12 @@ class Rerun:
         count: how often this was done, this time included.
     """
 
-    results: str
+    results: Annotated[str, Field(alias="former")]
     lanes: list[int]
     count: int
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, config=_STORED)
 class Manifest:
     """A run.
 
@@ -64,11 +67,14 @@ class Manifest:
     dtype: str
     device: str
     lanes: int
-    batch: int
+    batch: Annotated[int, Field(alias="chunk")]
     save_every: int
     options: list[str]
     rerun: Rerun | None = None
     forced: list[str] = dataclasses.field(default_factory=list)
+
+
+_KIND = TypeAdapter(Manifest)
 
 
 def describe(
@@ -77,10 +83,8 @@ def describe(
     """The manifest of a run that starts now.
 
     Args:
-        spec: the specification file.
         root: folder of the data.
         inputs: SHA-256 by measurement file.
-        dtype: of the computation.
         device: kind of device.
         sizes: the other attributes of `Manifest`.
     """
@@ -124,9 +128,7 @@ def differences(was: Manifest, now: Manifest) -> Iterator[str]:
 
 def as_dict(manifest: Manifest) -> dict[str, object]:
     """What is stored of a manifest."""
-    stored = _renamed(dataclasses.asdict(manifest), _RUN_KEYS)
-    if manifest.rerun is not None:
-        stored["rerun"] = _renamed(dataclasses.asdict(manifest.rerun), _RERUN_KEYS)
+    stored = _KIND.dump_python(manifest, by_alias=True)
     return {"schema": SCHEMA, "schema_version": SCHEMA_VERSION} | stored
 
 
@@ -173,39 +175,7 @@ def from_dict(content: object) -> Manifest:
     if (found.pop("schema", None), found.pop("schema_version", None)) != (SCHEMA, SCHEMA_VERSION):
         raise ValueError("not the manifest of a run, or one of another version")
     try:
-        rerun = found.pop("rerun")
-        _check_types(Manifest, found, _RUN_KEYS, {"rerun"})
-        run = Manifest(**_renamed(found, {key: name for name, key in _RUN_KEYS.items()}))
-        if rerun is None:
-            return run
-        _check_types(Rerun, rerun, _RERUN_KEYS)
-        rerun = Rerun(**_renamed(rerun, {key: name for name, key in _RERUN_KEYS.items()}))
-        return dataclasses.replace(run, rerun=rerun)
-    except (TypeError, KeyError) as error:
-        raise ValueError(f"not the manifest of a run: {error}") from None
-
-
-def _renamed(content: dict, names: dict[str, str]) -> dict:
-    """The same content, keys replaced by `names`."""
-    return {names.get(key, key): value for key, value in content.items()}
-
-
-def _check_types(
-    kind: type, found: dict, keys: dict[str, str], apart: Collection[str] = ()
-) -> None:
-    """Refuse values that are not of the field's type.
-
-    Raises:
-        TypeError: naming the key on file.
-        KeyError: a key is missing.
-    """
-    for field, hint in get_type_hints(kind).items():
-        if field in apart:
-            continue
-        name, wanted = keys.get(field, field), get_origin(hint) or hint
-        if not isinstance(found[name], wanted) or isinstance(found[name], bool):
-            raise TypeError(f"{name} is {found[name]!r}; expected {wanted.__name__}")
-        inner = get_args(hint)[-1:]
-        parts = found[name].values() if isinstance(found[name], dict) else found[name]
-        if inner and not all(isinstance(part, inner) for part in parts):
-            raise TypeError(f"{name} holds something else than {inner[0].__name__}")
+        return _KIND.validate_json(json.dumps(found))
+    except ValidationError as error:
+        key = ".".join(map(str, error.errors()[0]["loc"]))
+        raise ValueError(f"not the manifest of a run: {key}: {error.errors()[0]['msg']}") from None

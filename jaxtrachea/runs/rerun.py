@@ -40,7 +40,6 @@ def begin(
 
     Args:
         target: folder of the finished run.
-        finished: its manifest.
         now: what would be run now; its sizes are used.
         lanes: to fit again.
     """

@@ -56,7 +56,6 @@ def slots(study: Study, free: float) -> int:
     """Lanes to compute together, a power of two: what memory and, on a CPU, the cache can hold.
 
     Args:
-        study: the study.
         free: memory of the device that is free, bytes.
     """
     fitting = max_in_memory(study.bytes_per_lane, free)
@@ -157,7 +156,6 @@ def load(path: Path, run: str, lanes: np.ndarray, study: Study) -> FitResult | N
     """A saved shard, or None where there is none, or a damaged one, or one of another run.
 
     Args:
-        path: file.
         run: name of the run it must belong to.
         lanes: that it must hold.
         study: of these lanes.

@@ -137,8 +137,6 @@ def follow(scene: Scene, anchor: Anchor, here: Instant, most: Float[Array, ""]) 
     """The anchor after its place has followed the tool's contact; its press is the same vector.
 
     Args:
-        scene: -
-        anchor: -
         here: the tool now.
         most: distance at which the place follows, mm.
     """
@@ -188,7 +186,6 @@ def yielded(
     """What is left of a press after the anchor has given way: no more than the borders allow.
 
     Args:
-        scene: -
         way: of the press, see `press_vector`.
         depth: -gap of the tool, mm; positive.
         place: the skeleton at the anchor.

@@ -149,11 +149,7 @@ def make_scene(
 
 
 def _named(path, tool) -> tuple[dict[str, Poses | Presses], dict[str, Tool]]:
-    """Checked paths and tools by name; of a bare path by the empty one.
-
-    Raises:
-        ValueError: see `make_scene`.
-    """
+    """Checked paths and tools by name; of a bare path by the empty one."""
     if not isinstance(path, Mapping):
         check_path(path)
         check_word("tool", tool, Tool | Shape | None)
@@ -184,11 +180,7 @@ def _named(path, tool) -> tuple[dict[str, Poses | Presses], dict[str, Tool]]:
 
 
 def _check_friction(tools: Mapping[str, Tool], effects: EffectOptions) -> None:
-    """Refuse friction of some tools alone: no rule may leave out what is given.
-
-    Raises:
-        PlanError: naming a tool that has none.
-    """
+    """Refuse friction of some tools alone: no rule may leave out what is given."""
     without = [name for name, tool in tools.items() if tool.friction is None]
     if 0 < len(without) < len(tools) and effects.friction == "auto":
         why = f"tool {without[0]!r} has none"
@@ -200,11 +192,7 @@ def _check_friction(tools: Mapping[str, Tool], effects: EffectOptions) -> None:
 
 
 def _check_apart(paths: Mapping[str, Poses | Presses]) -> None:
-    """Refuse two tools that are on one and the same path throughout.
-
-    Raises:
-        ValueError: naming both.
-    """
+    """Refuse two tools that are on one and the same path throughout."""
     seen: dict[bytes, str] = {}
     for name, path in paths.items():
         key = b"".join(np.asarray(v).tobytes() for v in jax.tree.leaves(path))

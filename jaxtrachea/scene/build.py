@@ -76,7 +76,6 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     """Read what the specification names and choose the program.
 
     Args:
-        spec: the scene.
         folder: that relative file names start from.
         counted: begins a stage of the work of this name; returns what its steps are told to.
 
@@ -84,7 +83,7 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         SpecError: a file or a value that cannot be used, with its key.
     """
     files: list[Path] = []
-    counted = counted or _uncounted
+    counted = counted or (lambda text: None)
     geometry, mesh, notes = _trachea(spec.trachea, folder, files, counted)
     material = material_of(spec, geometry)
     notes += ends_not_given(spec)
@@ -189,10 +188,6 @@ def ends_not_given(spec: SceneSpec) -> tuple[str, ...]:
         f"sections: {', '.join(taken)} (not given). A fit has what its wall gives, c_end = 0 among "
         "it: for estimates of a fit name them, or give the [wall] of the fit",
     )
-
-
-def _uncounted(_: str) -> None:
-    """Nobody looks on."""
 
 
 def dropped_effects(scene: Scene) -> tuple[str, ...]:

@@ -35,9 +35,7 @@ def force_by_pose(
     """Force on the tube and its moment about the tool's origin: dE/dpose, row by row.
 
     Args:
-        scene: -
         material: values that are not negative.
-        path: of the tool.
         used: presses as computed, straight in; NaN where refused.
         moved: what they do.
         made: the tool's way, with its `pull`.
@@ -106,9 +104,7 @@ def forces_by_poses(
     `mechanics.energy`.
 
     Args:
-        scene: -
         material: values that are not negative.
-        solved: the row.
         compliance: what contacts feel of each other, mm/N, from their places and angles.
         ways: the poses of every tool, and what they are to the wall.
         pull: to derivatives by the poses.

@@ -16,7 +16,6 @@ def lay(line: Centreline, points: Float[Array, "points 3"]) -> Float[Array, "poi
     """Points of the straightened tube (s, y, z) where they are on the bent one, mm.
 
     Args:
-        line: the centreline.
         points: s along it, then along anterior and lateral, mm.
     """
 

@@ -162,11 +162,7 @@ class Effect:
     levels: tuple[str, ...] = ()
 
     def __post_init__(self):
-        """Refuse a kind that is none.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse a kind that is none (`ValueError`)."""
         check_record(self)
 
     def value(self, level: str) -> Any:

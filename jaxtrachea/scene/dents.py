@@ -65,7 +65,6 @@ def lay_out(
         each: the scene as each tool sees it.
         s: of the contacts, mm.
         phi: rad.
-        paths: of the tools.
         made: their ways; None: presses.
     """
     parts = [dent_parts(*one) for one in zip(each, paths, made, strict=True)]

@@ -106,11 +106,7 @@ def skeleton(case: Case) -> Verdict:
 
 
 def _sections(case: Case) -> Verdict:
-    """Deforming cross-sections, which have no other level; what they cannot do is refused.
-
-    Raises:
-        PlanError: naming what the user asked for and the cure.
-    """
+    """Deforming cross-sections, which have no other level; what they cannot do is refused."""
     facts, options, levels = case.facts, case.options, case.levels
     why, cure = "the material is that of deforming cross-sections", "use 'sections', or 'auto'"
     refused = {"linear": (why, cure), "softening": (why, cure)}

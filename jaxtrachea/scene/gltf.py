@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.scene.recording import Recording
+from jaxtrachea.trachea.mesh import vertex_normals
 
 #: Rows at most: viewers hold a few hundred targets.
 MAX_ROWS = 100
@@ -55,10 +56,6 @@ def write_glb(path: Path, recording: Recording) -> None:
     """Write the animation; of more than `MAX_ROWS` solved rows, these many evenly.
 
     Colours show wall and rings; glTF moves no colours. Between two rows everything moves evenly.
-
-    Args:
-        path: of the new file.
-        recording: see there.
 
     Raises:
         OSError: the file cannot be written.
@@ -129,15 +126,9 @@ def _tool(buffer: _Buffer, triangles) -> dict[str, Any]:
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals of the vertices, by the areas of their triangles."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    areas = np.cross(b - a, c - a)
-    out = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(areas[:, k], 3), len(vertices)) for k in range(3)],
-        axis=1,
-    )
-    size = np.linalg.norm(out, axis=1, keepdims=True)
-    return np.where(size > 0, out / np.where(size > 0, size, 1), [0.0, 1.0, 0.0])
+    """Of the vertices; upwards where all triangles are degenerate: glTF wants unit normals."""
+    normals = vertex_normals(vertices, faces)
+    return np.where(normals.any(axis=1, keepdims=True), normals, [0.0, 1.0, 0.0])
 
 
 def _quaternions(rotation: np.ndarray) -> np.ndarray:

@@ -70,17 +70,7 @@ class Grip(NamedTuple):
 def grip(
     scene: Scene, material: Material, state: Any, last: Instant, here: Instant, first: Anchor, hit
 ) -> Grip:
-    """Press the place without friction.
-
-    Args:
-        scene: -
-        material: -
-        state: a `step.State`.
-        last: the tool in the step before.
-        here: the tool now.
-        first: the anchor of a first touch.
-        hit: it touches from outside.
-    """
+    """Press the place without friction."""
     depth = -here.seen.gap[0]
     if scene.plan.options.contact == "bonded":
         anchor = pick(state.touching, state.anchor, first)

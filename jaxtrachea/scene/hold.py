@@ -24,16 +24,7 @@ def hold(
     inside: Bool[Array, "1"],
     at_rest: History | None = None,
 ) -> tuple[Any, Poses, Approach, Grip]:
-    """The next state but for the side; pose and way of the tool on its place; its grip.
-
-    Args:
-        scene: -
-        material: -
-        state: a `step.State`.
-        here: the tool now.
-        inside: it is in the lumen.
-        at_rest: history of nothing, of a force that relaxes.
-    """
+    """The next state but for the side; pose and way of the tool on its place; its grip."""
     last, first, hit = touched(scene, state, here, inside)
     held = (rub if scene.plan.friction else grip)(scene, material, state, last, here, first, hit)
     rest, made = as_approach(scene, held.anchor, held.way, here, inside)

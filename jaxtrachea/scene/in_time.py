@@ -60,8 +60,6 @@ def samples_of(
     """Rows as samples of a force that relaxes, and which of them go back in time.
 
     Args:
-        relaxation: branches.
-        before: -
         displacement: of the tool, or of all of them, mm.
         refused: rows by status.
     """

@@ -54,7 +54,6 @@ def landing(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> La
 
     Args:
         scene: with a tube.
-        path: of the tool.
         seen: its contact with the tube at rest, row by row.
         first: the row of first touch; if it does not touch, the place is its own.
     """

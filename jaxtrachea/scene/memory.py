@@ -38,7 +38,6 @@ def recall(
     """What a step begins with.
 
     Args:
-        scene: -
         memory: after the step before.
         rest: the history of nothing.
         anchor: the place of the tool now.

@@ -84,25 +84,13 @@ class Row:
 
 
 class OneRow:
-    """A compiled program, and the state that its next call begins with.
-
-    Attributes:
-        state: -
-    """
+    """A compiled program, and the state that its next call begins with."""
 
     def __init__(
         self, scene: Scene, setting: Callable, step: Callable,
         state: Array | np.ndarray, *given: Any,
     ):  # fmt: skip
-        """Compile.
-
-        Args:
-            scene: see `Row`.
-            setting: -
-            step: -
-            state: to begin with.
-            given: arrays as they are given at each call.
-        """
+        """Compile."""
         row = Row(scene, setting, step)
         row.trace(state, *given)
         self._contacts = row.contacts

@@ -33,7 +33,6 @@ def path_of(
     """The path of a scene; of several tools by name: legs of one tool follow one another.
 
     Args:
-        spec: the scene.
         folder: that relative file names start from.
         files: that were read; those of the path are added.
         geometry: of the tube that it presses.
@@ -76,9 +75,6 @@ def _times(
         legs: by their place in the file.
         rows: of each leg.
         own: times that a file gives, from the end of the leg before on.
-
-    Raises:
-        SpecError: a leg without a time beside others that have one, or with two.
     """
     timed = [
         leg.duration is not None or t is not None for leg, t in zip(legs.values(), own, strict=True)
@@ -150,11 +146,7 @@ def _leg(leg: PathSection, i: int, folder: Path, files: list[Path]):
 
 
 def _leg_of_file(leg: PathSection, key: str, folder: Path, files: list[Path]):
-    """The same, of a CSV file.
-
-    Raises:
-        SpecError: as `read_table`; times that fall.
-    """
+    """The same, of a CSV file."""
     path = named_file(folder, leg.file or "", key, files)
     angles = ("rx", "ry", "rz")
     found = read_table(path, key, ("x", "y", "z"), dict.fromkeys(angles, "angle") | {"t": "time"})
@@ -208,7 +200,6 @@ def read_table(
     """Columns of a CSV file with units in its header, by name.
 
     Args:
-        path: of the file.
         key: that names it.
         needed: lengths, mm.
         optional: dimension of those that may lack.
@@ -251,11 +242,7 @@ def read_table(
 
 
 def _cell(row: list[str], at: int, number: int) -> float:
-    """A number of the table.
-
-    Raises:
-        ValueError: it is none, or is missing.
-    """
+    """A number of the table."""
     if at >= len(row):
         raise ValueError(f"row {number} below the header has {len(row)} cells; complete it")
     try:

@@ -26,11 +26,6 @@ def draw_series(scene: Scene, path: Poses | Presses, out: Simulation) -> Figure:
     """Normal force, force along the surface with the limit of friction, and motion of the wall.
 
     All are drawn along the way of the tool. A row without a solution is a cross on the axis.
-
-    Args:
-        scene: its friction is read.
-        path: of the simulation.
-        out: the simulation.
     """
     way, label = _way(path, out)
     status = np.asarray(out.status)

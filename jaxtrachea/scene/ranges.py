@@ -58,7 +58,6 @@ def outside_plan(
     own where the plan did not.
 
     Args:
-        scene: -
         material: as given to `simulate`.
         presses: of every row.
         pressing: whether it does; shape (rows,). The others need nothing but their statuses.
@@ -161,7 +160,6 @@ def depth_share(scene: Scene, depth, skeleton, inward):
     motion along the surface as nothing.
 
     Args:
-        scene: -
         depth: local indentation, mm; shape (..., 3).
         skeleton: displacement of C with the skeleton, mm; likewise.
         inward: inward normal of the tube at the contact; likewise.

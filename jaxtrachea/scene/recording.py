@@ -62,9 +62,6 @@ class Recording(NamedTuple):
 def recording_of(stored: StoredSimulation) -> Recording:
     """The surfaces of a simulation.
 
-    Args:
-        stored: as `read_simulation` gives it.
-
     Raises:
         NoSurface: it has no surface, or no row was solved.
     """

@@ -21,7 +21,6 @@ def make_plan(
     """Choose the program of a scene.
 
     Args:
-        facts: of the scene.
         options: of the user.
         finest: effects whose level in `options` is not the user's wish, but the finest.
 
@@ -50,11 +49,7 @@ def make_plan(
 
 
 def _decided(effect: Effect, case: Case) -> Decision:
-    """The level of an effect; the rules below read it in the case.
-
-    Raises:
-        PlanError: a wish that cannot be met.
-    """
+    """The level of an effect; the rules below read it in the case."""
     verdict, requested = effect.rule(case), getattr(case.options, effect.name)
     if requested in verdict.refused:
         raise PlanError(effect.name, repr(requested), *verdict.refused[requested])

@@ -251,7 +251,6 @@ def pressed(
     """All of `simulate` but the surface, and what that follows from.
 
     Args:
-        scene: -
         material: -
         path: as for `simulate`.
         made: the tool's way; None: the path is of presses.

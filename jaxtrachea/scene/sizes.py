@@ -26,7 +26,6 @@ def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
     """Refuse lengths that are most likely given in another unit.
 
     Args:
-        geometry: the tube at rest.
         outer: radius of its outside, mm.
         tool: or None.
 
@@ -62,7 +61,6 @@ def check_width(geometry: Geometry, tool: Shape | None, half_width: float) -> No
     """Refuse a width that the tube has no place for, or that the tool has not.
 
     Args:
-        geometry: the tube at rest.
         tool: or None.
         half_width: of its flat end along the tube, mm.
 

@@ -225,11 +225,7 @@ class SceneSpec(Section):
         return list(dict.fromkeys(leg.tool for leg in self.path if leg.tool is not None))
 
     def _check_names(self) -> None:
-        """Refuse tools and paths that do not belong to one another.
-
-        Raises:
-            ValueError: the key, what was found and what is expected.
-        """
+        """Refuse tools and paths that do not belong to one another."""
         many = self.tool if isinstance(self.tool, list) else []
         if not isinstance(self.tool, list | None) and self.tool.name is not None:
             raise ValueError("tool.name: of several tools alone; write [[tool]], or remove it")

@@ -170,11 +170,7 @@ def step(
 
 
 def _checked_pose(scene: Scene, rotation, translation, of: str) -> tuple[Array, Array]:
-    """A pose as arrays; `of`: what it is of, as in errors.
-
-    Raises:
-        ValueError: see `step`.
-    """
+    """A pose as arrays; `of`: what it is of, as in errors."""
     dtype = scene.footprint.dtype
     rotation = shaped(f"{of}rotation", rotation, (3, 3), why=" (one pose)")
     translation = shaped(f"{of}translation", translation, (3,), why=" (one pose)")
@@ -321,7 +317,6 @@ class Changeable(NamedTuple):
     """What may change from step to step: an argument of the program, not a constant in it.
 
     Attributes:
-        material: -
         tool: its shape about its own origin; None: several, which stay.
         footprint: of the scene, which goes with the tool.
     """

@@ -128,11 +128,7 @@ def draw_surface(
 
 
 def draw_rest(scene: Scene) -> Figure:
-    """The tube at rest with its rings, from the front and the side; its colour has no meaning.
-
-    Args:
-        scene: with a mesh.
-    """
+    """The tube at rest with its rings, from the front and the side; its colour has no meaning."""
     mesh = scene.mesh
     assert mesh is not None
     wall = Triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces))
@@ -251,11 +247,7 @@ def inside_rings(scene: Scene, mesh: Mesh) -> np.ndarray:
 
 
 def _camera(axes: np.ndarray) -> np.ndarray:
-    """Rows right, up and towards the viewer: the larynx is right, the contact's normal is up.
-
-    Args:
-        axes: along the tube, the normal and the third as columns.
-    """
+    """Rows right, up and towards the viewer: the larynx is right, the contact's normal is up."""
     along, normal, aside = axes.T
     towards = np.cos(ASIDE) * normal + np.sin(ASIDE) * aside + TILT * along
     towards /= np.linalg.norm(towards)
@@ -264,9 +256,14 @@ def _camera(axes: np.ndarray) -> np.ndarray:
     return np.stack([np.cross(up, towards), up, towards])
 
 
+def _turned(triangles: np.ndarray) -> np.ndarray:
+    """Normals of projected triangles; towards the viewer where the last component is positive."""
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
 def _shade(triangles: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lightness of projected triangles, 0.5 to 1, and whether they face the viewer."""
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normal = _turned(triangles)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     light = np.array([-0.3, 0.65, 0.7]) / np.linalg.norm([-0.3, 0.65, 0.7])
     return 0.5 + 0.5 * np.clip(np.abs(normal @ light), 0, 1), normal[:, 2] > 0
@@ -314,8 +311,7 @@ def _draw_solids(axis: Any, camera: np.ndarray, wall, tool, share, rings):
     axis.add_collection(
         PolyCollection(list(corners[:, :, :2]), facecolors=faced, edgecolors=edges, linewidths=0.3)
     )
-    turned = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    edge = crossings(wall.faces[turned[:, 2] > 0], rings).at(seen)
+    edge = crossings(wall.faces[_turned(triangles)[:, 2] > 0], rings).at(seen)
     axis.add_collection(LineCollection(list(edge[:, :, :2]), colors=RING, linewidths=0.7))
     points = triangles.reshape(-1, 3)[:, :2]
     if tool is not None:
@@ -334,8 +330,7 @@ def _frame_view(axis: Any, camera: np.ndarray, frame: np.ndarray, low, high) -> 
 def _draw_rest(axis: Any, seen: np.ndarray, faces: np.ndarray, share: np.ndarray) -> None:
     """Edges of the surface at rest where it has moved most."""
     faces = faces[(share[faces] > 0.12).all(axis=1)]
-    triangles = seen[faces]
-    front = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] > 0
+    front = _turned(seen[faces])[:, 2] > 0
     edges = np.unique(np.sort(faces[front][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     axis.add_collection(
         LineCollection(list(seen[edges][:, :, :2]), colors=REST, linewidths=0.35, alpha=0.45)

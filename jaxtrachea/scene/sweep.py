@@ -61,7 +61,6 @@ def sweep(
             OFF_PLAN where a point presses and the material gives more than the plan has (as in
             `simulate`), or off the midline with a tool's width or on a skeleton that softens or has
             one plane.
-        material: -
         s: mm.
         phi: rad, within the half-angle of the rings; else BEHIND_GAP where it presses.
         depth: of the tool along the inward normal, mm; 0 and less: NO_CONTACT (see `Options`).

@@ -106,7 +106,6 @@ def press_together(
 
     Args:
         scene: of several instruments.
-        material: -
         ways: path of each tool, all of as many rows, and how it comes; None: a path of presses.
         present: tools that are there; None: all, and those that are glued from first touch on.
         before: of a force that relaxes; else None.

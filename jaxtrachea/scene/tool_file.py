@@ -142,11 +142,7 @@ def _closed(body: Surface) -> bool:
 
 
 def _check_bodies(found: dict[str, Surface]) -> None:
-    """Refuse bodies that are no convex parts of a tool.
-
-    Raises:
-        MeshError: too many, one that is not convex, or one inside out beside others that are not.
-    """
+    """Refuse bodies that are no convex parts of a tool."""
     if len(found) > shapes.MAX_PARTS:
         raise MeshError(
             f"it has {len(found)} bodies; expected at most {shapes.MAX_PARTS} convex parts",
@@ -203,11 +199,7 @@ def _planes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "faces 4"]:
 
 
 def _hull(points: Float[np.ndarray, "n 3"]):
-    """The convex hull.
-
-    Raises:
-        MeshError: flat, or a line.
-    """
+    """The convex hull."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:

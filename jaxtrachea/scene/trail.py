@@ -67,7 +67,6 @@ def scale_to_touch(
     to 0: a tool that lies further inside of the sunk surface than that stays in it.
 
     Args:
-        tool: -
         pose: of the tool, one row.
         near: distance of every vertex from the tool's place on the surface at rest, mm.
         sunk: vertices moved with the skeleton, in the frame of the tool's pose, mm.

@@ -26,10 +26,6 @@ def write_vtk(folder: Path, recording: Recording) -> None:
     solution has its tools alone. The wall has `displacement` (mm) and `ring` (1 on a ring), the
     contact point `force` (N), `s` (mm) and `phi` (rad).
 
-    Args:
-        folder: that exists.
-        recording: see there.
-
     Raises:
         OSError: a file cannot be written.
     """
@@ -72,7 +68,6 @@ def write_map(path: Path, mesh: Mesh, s: np.ndarray, phi: np.ndarray, out: Sweep
 
     Args:
         path: of a .vtp file.
-        mesh: of the scene.
         s: of the grid, mm; 2 or more.
         phi: of the grid, rad; 2 or more.
         out: of its points, s by s.

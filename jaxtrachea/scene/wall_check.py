@@ -106,14 +106,7 @@ def checked_span(geometry: Geometry) -> tuple[float, float]:
 
 
 def measure(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> WallError:
-    """Gaps of balls beside the wall, along the rings (`checked_span`).
-
-    Args:
-        mesh: the surface.
-        geometry: its skeleton.
-        patches: of its wall.
-        count: number of balls.
-    """
+    """Gaps of balls beside the wall, along the rings (`checked_span`)."""
     centres, s, radius = _balls(mesh, geometry, count)
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     gap = _distance(vertices[faces], centres) - radius
@@ -172,12 +165,12 @@ class Beyond(NamedTuple):
         )
 
 
-def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> Beyond:
+def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches) -> Beyond:
     """Gaps of balls beside the wall beyond the first and the last ring. Arguments as `measure`."""
     none = (math.nan, math.nan)
     uncertain = np.zeros(patches.centres.shape[0], bool)
     try:
-        centres, s, radius = _balls(mesh, geometry, count, beyond=True)
+        centres, s, radius = _balls(mesh, geometry, COUNT, beyond=True)
     except MeshError:  # no wall there
         return Beyond(uncertain, 0.0, (none, none))
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)

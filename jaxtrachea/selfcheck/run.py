@@ -128,14 +128,7 @@ def _basis(shapes, lanes: int, dtype: str):
 def run_table(
     cases: list[Case], truths: dict[str, Truth], dtypes, *, unoptimised: bool = False
 ) -> Iterator[Outcome]:
-    """Run all cases; outcomes come in the order of the table, function by function.
-
-    Args:
-        cases: rows of the table.
-        truths: by name.
-        dtypes: some of `table.DTYPES`.
-        unoptimised: compile without optimisation: not the programs that are otherwise run.
-    """
+    """Run all cases; outcomes come in the order of the table, function by function."""
     groups: dict[tuple[str, str], list[Case]] = {}
     for case in cases:
         for dtype in dtypes:

@@ -119,9 +119,9 @@ class Truth:
     gradient_spread: dict[str, dict[str, np.ndarray]]
 
 
-def read_cases(text: str | None = None) -> list[Case]:
-    """Every row of cases.toml (or of `text`, of the same form), in its order."""
-    given = tomllib.loads(CASES.read_text("utf-8") if text is None else text)
+def read_cases() -> list[Case]:
+    """Every row of cases.toml, in its order."""
+    given = tomllib.loads(CASES.read_text("utf-8"))
     return [
         _case(function, group, row) for function, group in given.items() for row in group["case"]
     ]
@@ -179,9 +179,9 @@ def _tolerance(said: dict | None, dtype: str) -> Tolerance:
     return Tolerance(pick("value"), pick("gradient"), said["why"])
 
 
-def read_truth(text: str | None = None) -> dict[str, Truth]:
+def read_truth() -> dict[str, Truth]:
     """The truth of every case that has an answer, by its name."""
-    given = json.loads(TRUTH.read_text("utf-8") if text is None else text)
+    given = json.loads(TRUTH.read_text("utf-8"))
 
     def array(v):
         return np.asarray(v, dtype=float)

@@ -144,7 +144,6 @@ def bind(mesh: Mesh, geometry: Geometry, known: Binding | None = None) -> Bindin
     """Find the patch of every vertex and the fraction of the way through it.
 
     Args:
-        mesh: -
         geometry: with the rings.
         known: binding of the same mesh to other rings: spares sorting the vertices anew.
     """

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.mesh import MeshError, face_vectors
 from jaxtrachea.trachea.sections import ANGLES, Cells, contour
 
 #: Cross-sections through which the centreline is laid.
@@ -108,11 +108,8 @@ def find_centreline(vertices, faces, given=None) -> Line:
         if not (np.isfinite(given).all() and np.ptp(given, axis=0).max() > 0):
             raise MeshError("centreline is no line: expected finite points, not all at one place")
         return _over(vertices, _fine(given))
-    corners = vertices[faces]
-    weight = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    middle = corners.mean(axis=1)
+    weight = np.linalg.norm(face_vectors(vertices, faces), axis=1)
+    middle = vertices[faces].mean(axis=1)
     centre = np.average(middle, axis=0, weights=weight)
     spread, axes = np.linalg.eigh(np.cov((middle - centre).T, aweights=weight))
     if spread[2] < LONGER * spread[1]:

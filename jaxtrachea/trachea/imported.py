@@ -100,7 +100,6 @@ def read_mesh(
     """Read a trachea from a surface file.
 
     Args:
-        path: the file.
         landmarks: what need not be found in the shape.
         unit: of the file, "mm" say. None: metres for GLB and glTF, as that format says; else the
             one of mm, cm, m, in that gives a plausible length, refused if there are two.

@@ -51,11 +51,7 @@ class Fitted:
     if_named: bool = False
 
     def __post_init__(self):
-        """Refuse words that no fit knows.
-
-        Raises:
-            ValueError: naming the field.
-        """
+        """Refuse words that no fit knows (`ValueError`)."""
         check_word("scale", self.scale, Scale)
         check_word("scope", self.scope, Scope)
 
@@ -98,29 +94,25 @@ class Declaration:
     fit: Fitted | None = None
 
     def __post_init__(self):
-        """Refuse words that have no meaning.
-
-        Raises:
-            ValueError: naming the field.
-        """
+        """Refuse words that have no meaning (`ValueError`)."""
         check_word(f"{self.name}: part", self.part, Part)
         check_word(f"{self.name}: needs", self.needs, Needs)
         check_word(f"{self.name}: each", self.varies_by, VariesBy)
 
 
-def _field(declaration: Declaration) -> Any:
-    """A field of `Material`; by keyword, and None unless given, where it has an `absent`.
+def _field(name: str, unit: str, dimension: str, description: str, **more: Any) -> Any:
+    """A field and its declaration; by keyword, and None unless given, where it has an `absent`.
 
     Python numbers become arrays (one door, so that jit does not retrace).
     """
-
-    def convert(v):
-        return None if v is None else real(declaration.name, v)
-
+    declaration = Declaration(name, unit, dimension, description, **more)
     metadata = {"declaration": declaration}
-    if declaration.absent:
-        return eqx.field(default=None, kw_only=True, converter=convert, metadata=metadata)
-    return eqx.field(converter=lambda v: real(declaration.name, v), metadata=metadata)
+    if not declaration.absent:
+        return eqx.field(converter=lambda v: real(name, v), metadata=metadata)
+    return eqx.field(
+        default=None, kw_only=True, converter=lambda v: None if v is None else real(name, v),
+        metadata=metadata,
+    )  # fmt: skip
 
 
 class Material(eqx.Module):
@@ -135,121 +127,85 @@ class Material(eqx.Module):
     """
 
     EI_L: Float[Array, "..."] = _field(
-        Declaration(
-            "EI_L", "N mm^2", "bending_stiffness", "ligament bending stiffness",
-            symbol="E_L I_L", part="skeleton", varies_by="span", fit=Fitted(10.0, 1e-4, 1e7),
-        )
+        "EI_L", "N mm^2", "bending_stiffness", "ligament bending stiffness",
+        symbol="E_L I_L", part="skeleton", varies_by="span", fit=Fitted(10.0, 1e-4, 1e7),
     )  # fmt: skip
     GA_L: Float[Array, "..."] | None = _field(
-        Declaration(
-            "GA_L", "N", "force", "ligament shear stiffness",
-            symbol="kappa G A", part="skeleton", needs="shear", absent="no shear", varies_by="span",
-            fit=Fitted(10.0, 1e-4, 1e6),
-        )
+        "GA_L", "N", "force", "ligament shear stiffness",
+        symbol="kappa G A", part="skeleton", needs="shear", absent="no shear", varies_by="span",
+        fit=Fitted(10.0, 1e-4, 1e6),
     )  # fmt: skip
     k_M: Float[Array, "..."] = _field(
-        Declaration(
-            "k_M", "N/mm", "stiffness", "muscle stiffness under a ring",
-            part="skeleton", varies_by="ring", fit=Fitted(0.1, 1e-6, 1e6),
-        )
+        "k_M", "N/mm", "stiffness", "muscle stiffness under a ring",
+        part="skeleton", varies_by="ring", fit=Fitted(0.1, 1e-6, 1e6),
     )  # fmt: skip
     k_1: Float[Array, ""] = _field(
-        Declaration(
-            "k_1", "N/mm", "stiffness", "linear contact stiffness",
-            symbol="m_0 omega_0^2", part="contact", fit=Fitted(1.0, 1e-6, 1e6),
-        )
+        "k_1", "N/mm", "stiffness", "linear contact stiffness",
+        symbol="m_0 omega_0^2", part="contact", fit=Fitted(1.0, 1e-6, 1e6),
     )  # fmt: skip
     k_3: Float[Array, ""] = _field(
-        Declaration(
-            "k_3", "N/mm^3", "cubic_stiffness", "cubic contact stiffness",
-            symbol="3/4 m_0 beta_0^2 eps", part="contact", signed=True,
-            fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01),
-        )
+        "k_3", "N/mm^3", "cubic_stiffness", "cubic contact stiffness",
+        symbol="3/4 m_0 beta_0^2 eps", part="contact", signed=True,
+        fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01),
     )  # fmt: skip
     k_5: Float[Array, ""] | None = _field(
-        Declaration(
-            "k_5", "N/mm^5", "quintic_stiffness", "quintic contact stiffness",
-            part="contact", absent="a cubic law", signed=True,
-            fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
-        )
+        "k_5", "N/mm^5", "quintic_stiffness", "quintic contact stiffness",
+        part="contact", absent="a cubic law", signed=True,
+        fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
     )  # fmt: skip
     k_1_ring: Float[Array, ""] | None = _field(
-        Declaration(
-            "k_1_ring", "N/mm", "stiffness", "linear contact stiffness on a ring",
-            part="contact", needs="two-material", absent="one law everywhere",
-            fit=Fitted(10.0, 1e-6, 1e6),
-        )
+        "k_1_ring", "N/mm", "stiffness", "linear contact stiffness on a ring",
+        part="contact", needs="two-material", absent="one law everywhere",
+        fit=Fitted(10.0, 1e-6, 1e6),
     )  # fmt: skip
     k_3_ring: Float[Array, ""] | None = _field(
-        Declaration(
-            "k_3_ring", "N/mm^3", "cubic_stiffness", "cubic contact stiffness on a ring",
-            part="contact", needs="two-material", absent="k_3", requires="k_1_ring", signed=True,
-            fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01, if_named=True),
-        )
+        "k_3_ring", "N/mm^3", "cubic_stiffness", "cubic contact stiffness on a ring",
+        part="contact", needs="two-material", absent="k_3", requires="k_1_ring", signed=True,
+        fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01, if_named=True),
     )  # fmt: skip
     k_5_ring: Float[Array, ""] | None = _field(
-        Declaration(
-            "k_5_ring", "N/mm^5", "quintic_stiffness", "quintic contact stiffness on a ring",
-            part="contact", needs="two-material", absent="k_5", requires="k_1_ring", signed=True,
-            fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
-        )
+        "k_5_ring", "N/mm^5", "quintic_stiffness", "quintic contact stiffness on a ring",
+        part="contact", needs="two-material", absent="k_5", requires="k_1_ring", signed=True,
+        fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
     )  # fmt: skip
     e_1: Float[Array, ""] | None = _field(
-        Declaration(
-            "e_1", "1/mm", "inverse_length", "softening of a press, linear in the way of the tool",
-            part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
-            fit=Fitted(0.05, 0.0, 10.0, "linear", 0.01),
-        )
+        "e_1", "1/mm", "inverse_length", "softening of a press, linear in the way of the tool",
+        part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
+        fit=Fitted(0.05, 0.0, 10.0, "linear", 0.01),
     )  # fmt: skip
     e_2: Float[Array, ""] | None = _field(
-        Declaration(
-            "e_2", "1/mm^2", "inverse_area", "softening of a press, quadratic part",
-            part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
-            fit=Fitted(0.002, 0.0, 10.0, "linear", 0.001),
-        )
+        "e_2", "1/mm^2", "inverse_area", "softening of a press, quadratic part",
+        part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
+        fit=Fitted(0.002, 0.0, 10.0, "linear", 0.001),
     )  # fmt: skip
     EA_L: Float[Array, "..."] | None = _field(
-        Declaration(
-            "EA_L", "N", "force", "ligament axial stiffness",
-            symbol="E_L A_L", part="skeleton", needs="axial", absent="no stretch", varies_by="span",
-        )
+        "EA_L", "N", "force", "ligament axial stiffness",
+        symbol="E_L A_L", part="skeleton", needs="axial", absent="no stretch", varies_by="span",
     )  # fmt: skip
     k_A: Float[Array, ""] | None = _field(
-        Declaration(
-            "k_A", "N/mm", "stiffness", "axial spring of the carina end",
-            part="skeleton", needs="axial", absent="held",
-        )
+        "k_A", "N/mm", "stiffness", "axial spring of the carina end",
+        part="skeleton", needs="axial", absent="held",
     )  # fmt: skip
     k_B: Float[Array, ""] | None = _field(
-        Declaration(
-            "k_B", "N/mm", "stiffness", "axial spring of the larynx end",
-            part="skeleton", needs="axial", absent="held",
-        )
+        "k_B", "N/mm", "stiffness", "axial spring of the larynx end",
+        part="skeleton", needs="axial", absent="held",
     )  # fmt: skip
     EI_C: Float[Array, ""] | None = _field(
-        Declaration(
-            "EI_C", "N mm^2", "bending_stiffness", "cartilage bending stiffness in a ring's plane",
-            symbol="E_C I_C", part="skeleton", needs="arch, sections", absent="rings do not bend",
-            fit=Fitted(25.0, 1e-3, 1e6),
-        )
+        "EI_C", "N mm^2", "bending_stiffness", "cartilage bending stiffness in a ring's plane",
+        symbol="E_C I_C", part="skeleton", needs="arch, sections", absent="rings do not bend",
+        fit=Fitted(25.0, 1e-3, 1e6),
     )  # fmt: skip
     k_t: Float[Array, ""] | None = _field(
-        Declaration(
-            "k_t", "N/mm", "stiffness", "muscular bar between the ends of a ring",
-            part="skeleton", needs="arch", absent="rings do not bend",
-        )
+        "k_t", "N/mm", "stiffness", "muscular bar between the ends of a ring",
+        part="skeleton", needs="arch", absent="rings do not bend",
     )  # fmt: skip
     EI_side: Float[Array, "..."] | None = _field(
-        Declaration(
-            "EI_side", "N mm^2", "bending_stiffness", "EI_L for bending along the circumference",
-            part="skeleton", needs="second plane", absent="EI_L", varies_by="span",
-        )
+        "EI_side", "N mm^2", "bending_stiffness", "EI_L for bending along the circumference",
+        part="skeleton", needs="second plane", absent="EI_L", varies_by="span",
     )  # fmt: skip
     GA_side: Float[Array, "..."] | None = _field(
-        Declaration(
-            "GA_side", "N", "force", "GA_L for shear along the circumference",
-            part="skeleton", needs="second plane", absent="GA_L", requires="GA_L", varies_by="span",
-        )
+        "GA_side", "N", "force", "GA_L for shear along the circumference",
+        part="skeleton", needs="second plane", absent="GA_L", requires="GA_L", varies_by="span",
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from jaxtrachea.trachea.cleaning import WELD, Surface
-from jaxtrachea.trachea.mesh import MeshError, edge_counts, unique_rows
+from jaxtrachea.trachea.mesh import MeshError, edge_counts, face_vectors, unique_rows
 
 #: Share of the area that an object may have that is left out, if it may be a piece of the wall; how
 #: far one that is closed may reach beyond the wall's ends, over the wall's length (the carinas of
@@ -15,8 +15,7 @@ LEFT_OUT, BEYOND = 0.02, 0.03
 
 def area_of(surface: Surface) -> float:
     """Area of all triangles."""
-    a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    return float(np.linalg.norm(face_vectors(*surface), axis=1).sum() / 2)
 
 
 def combined(surfaces: list[Surface]) -> Surface:

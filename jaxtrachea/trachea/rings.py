@@ -57,8 +57,10 @@ def find_anterior(shape: Shape, given=None) -> Shape:
     elif shape.cartilage is not None:
         angle, _ = _side(shape.cartilage.mean(axis=0))
     else:
-        angle, clear = _side(np.nan_to_num(_middle(relief(shape) ** 2)))
-        if not clear or not _has_relief(shape):
+        strength = _middle(relief(shape) ** 2)
+        angle, clear = _side(np.nan_to_num(strength))
+        # Waves of less than 1 % of the radius are no relief.
+        if not clear or not np.sqrt(strength).max() > 0.01 * np.nanmean(shape.radius):
             angle = _opposite_flat(shape)
     c, s = math.cos(angle), math.sin(angle)
     turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
@@ -171,11 +173,6 @@ def _middle(rows):
     seen = np.isfinite(rows)
     count = seen.sum(axis=0)
     return np.where(count > 0, np.where(seen, rows, 0).sum(axis=0) / np.maximum(count, 1), np.nan)
-
-
-def _has_relief(shape: Shape) -> bool:
-    """Whether the waves of the relief are more than 1 % of the radius."""
-    return bool(np.sqrt(_middle(relief(shape) ** 2)).max() > 0.01 * np.nanmean(shape.radius))
 
 
 def _side(strength) -> tuple[float, bool]:

@@ -43,9 +43,6 @@ def make_tube(
         flatten: by what part of the radius the posterior midline is drawn in; 0: round.
         lids: whether to close the ends; without, a tube open at both ends.
 
-    Returns:
-        The mesh, of the dtype of `geometry`.
-
     Raises:
         ValueError: naming the argument.
     """

@@ -42,9 +42,6 @@ def last_row(path: Path) -> Path:
 def whole_path(arguments: Arguments) -> Call:
     """The whole path in one call, as `jaxtrachea simulate` makes it; compiles it.
 
-    Args:
-        arguments: scene, material and path.
-
     Returns:
         A call that ends when all results are there.
     """
@@ -58,12 +55,6 @@ def one_pose(arguments: Arguments) -> Call:
 
     A step of a `Session` where one takes the scene. Else `simulate` of that row in the same form:
     numbers go in and out as one array each.
-
-    Args:
-        arguments: scene, material and path.
-
-    Returns:
-        As `whole_path`.
     """
     scene, material, path = arguments
     row = last_row(path)

@@ -128,7 +128,9 @@ def choose(
     named = {ladder.name: ladder for ladder in every}
     while True:
         picked = [rungs[-1] for rungs in options.values()]
-        changed = _combined(named, picked)
+        changed: dict[str, Any] = {}
+        for rung in picked:
+            changed |= named[rung.ladder].rungs[rung.level]
         levels = full.levels.changed(**changed)
         errors = trial.errors(levels)
         if not picked:
@@ -231,14 +233,6 @@ def _within(
         elif above is None:
             found.refused.extend(rungs)
     return None
-
-
-def _combined(named: dict[str, Ladder], picked: list[Rung]) -> dict[str, Any]:
-    """What all rungs together change in the finest levels."""
-    changed = {}
-    for rung in picked:
-        changed |= named[rung.ladder].rungs[rung.level]
-    return changed
 
 
 def _served(reference: Simulation) -> ValidRange:

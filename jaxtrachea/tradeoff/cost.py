@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.tradeoff.calls import Arguments, Call, last_row, one_pose, whole_path
+from jaxtrachea.tradeoff.operations import count_operations
 
 #: What is made least: time of the whole path in one call (`simulate`), of a pose a call
 #: (`Session`), or operations, those in float32 counted half: the same on every machine.
@@ -68,12 +68,7 @@ class Cost(NamedTuple):
 
 
 def operations(arguments: Arguments, *, step: bool = False) -> float:
-    """Of `simulate` for scene, material and path; those in float32 counted half.
-
-    Args:
-        arguments: scene, material and path.
-        step: of the last row of the path alone.
-    """
+    """Of `simulate` for scene, material and path; those in float32 counted half."""
     if step:
         scene, material, path = arguments
         arguments = scene, material, last_row(path)

@@ -46,12 +46,6 @@ def compare(
 
     Rings that were left out are put on the straight line between their neighbours, displacements of
     another mesh are interpolated at the reference's vertices.
-
-    Args:
-        found: -
-        reference: -
-        scenes: of both.
-        gradients: from `levels.solve`, of both; or None.
     """
     scene, fine = scenes
     joints = surface = millimetres = None

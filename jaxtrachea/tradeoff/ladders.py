@@ -26,8 +26,6 @@ class Ladder(NamedTuple):
     """One choice.
 
     Attributes:
-        name: -
-        kind: -
         rungs: what each changes in the finest levels, by name of the level; the finest last.
         base: what is changed for all of them, their reference included.
         effect: that it is of; empty: of none.

@@ -26,7 +26,6 @@ from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
-from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.tube import make_tube
 
@@ -58,7 +57,6 @@ class Levels:
         steps: Newton steps of the contact (`warm_steps`).
         mesh: vertices round and along the tube, against those of the scene.
         kept: number of rings nearest to the load.
-        dtype: -
     """
 
     plan: Plan
@@ -69,11 +67,7 @@ class Levels:
     dtype: Literal["float32", "float64"] = "float64"
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
+        """Refuse words and numbers that mean nothing (`ValueError`)."""
         check_record(self, sharpness=0.0, steps=1.0, mesh=0.0, kept=1.0)
 
     def changed(self, **levels: Any) -> "Levels":
@@ -91,8 +85,6 @@ class Full(NamedTuple):
 
     Attributes:
         scene: with the finest plan.
-        material: -
-        path: -
         levels: what that plan and the finest of all else are.
         facts: of the scene.
         options: of the user, what was `auto` at its finest.
@@ -117,11 +109,6 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
 
     Against the rules (`scene.rules`): rings are arches wherever EI_C and k_t are given, the dent
     has 32 centres, contacts are `fine`.
-
-    Args:
-        spec: of the scene.
-        staged: made from it.
-        coupling: instead of that of the specification.
 
     Raises:
         PlanError: a wish that cannot be met.
@@ -180,7 +167,10 @@ def program(full: Full, levels: Levels) -> tuple[Scene, Material, Poses | Presse
     scene = dataclasses.replace(scene, plan=plan, quality=dataclasses.replace(FINE, **work))
     if levels.mesh != 1:
         assert full.made is not None
-        scene = with_mesh(scene, _mesh(scene.geometry, full.made, levels.mesh))
+        around, along, wall, relief = full.made
+        around, along = max(round(around * levels.mesh), 3), max(round(along * levels.mesh), 1)
+        mesh = make_tube(scene.geometry, around=around, along=along, wall=wall, relief=relief)
+        scene = with_mesh(scene, mesh)
     if levels.kept < rings:
         x = scene.geometry.ring_positions[kept_rings(full, levels.kept)]
         scene = with_geometry(scene, dataclasses.replace(scene.geometry, ring_positions=x))
@@ -222,12 +212,6 @@ def _load(scene: Scene, path: Poses | Presses) -> np.ndarray:
     seen = jax.jit(touch_tube)(scene, path)
     s, gap = np.asarray(seen.s), np.asarray(seen.gap)
     return s[gap < 0] if (gap < 0).any() else s
-
-
-def _mesh(geometry: Geometry, made: tuple[int, int, float, float | None], factor: float):
-    around, along, wall, relief = made
-    many = max(round(around * factor), 3), max(round(along * factor), 1)
-    return make_tube(geometry, around=many[0], along=many[1], wall=wall, relief=relief)
 
 
 def solve(scene: Scene, material: AnyMaterial, path: Poses | Presses):

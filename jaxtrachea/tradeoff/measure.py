@@ -12,8 +12,6 @@ import numpy as np
 from jaxtrachea._compiler import quick_options
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Presses, Scene
-from jaxtrachea.tradeoff.choice import Choice
-from jaxtrachea.tradeoff.cost import Cost
 from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
@@ -21,7 +19,7 @@ from jaxtrachea.tradeoff.load import Load, processor
 from jaxtrachea.tradeoff.parts import inputs, part_of
 from jaxtrachea.tradeoff.timing import Compiled, Settings, compiled, timed, with_part
 
-__all__ = ["Settings", "choice_row", "environment", "measure", "measure_ladders"]
+__all__ = ["Settings", "environment", "measure", "measure_ladders"]
 
 DEFAULT = Settings()
 Report = Callable[[str], None]
@@ -42,9 +40,6 @@ def measure(
     """Errors and times of every rung of the scene's ladders; then a dict for each left out.
 
     Args:
-        name: of the scene.
-        full: the scene at its finest.
-        settings: -
         report: called with what is done next.
         curves: measured curves of the scene's specimen; or none.
         radius: markers no further from the contact say nothing, mm; negative: all count.
@@ -63,10 +58,7 @@ def measure_ladders(
     Each ladder is measured against its finest rung in float64, all else at its finest level.
 
     Args:
-        name: of the scene.
-        full: the scene at its finest.
         measured: the ladders.
-        settings: -
         report: called with what is done next.
         curves: as for `measure`.
         radius: likewise.
@@ -153,35 +145,7 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
                 joints[0].append([-float(moved[i, ring, 1])])
                 joints[1].append(at(curve.joint_displacement[:, column]))
     both = {"force": force, "joints": joints}
-    return {name: _number(relative(*v)) for name, v in both.items() if v[0]}
-
-
-def choice_row(name: str, choice: Choice, repeat: Cost, end: dict[str, Any]) -> dict[str, Any]:
-    """A choice as a line of JSON.
-
-    Args:
-        name: of the scene.
-        choice: -
-        repeat: its time, measured once more.
-        end: what `environment` gives.
-    """
-
-    def said(rungs):
-        return [
-            {"ladder": r.ladder, "level": r.level, "error": _number(r.errors.worst)} for r in rungs
-        ]
-
-    def short(cost):
-        return {k: _number(v) for k, v in cost._asdict().items()}
-
-    return {
-        "scene": name, "tolerance": choice.tolerance, "by": choice.by,
-        "dropped": said(choice.dropped), "refused": said(choice.refused),
-        "returned": said(choice.restored), "idle": said(choice.no_gain),
-        "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
-        "cost": short(choice.cost), "operations": round(choice.operations, 4),
-        "repeat": short(repeat),
-    } | end  # fmt: skip
+    return {name: number(relative(*v)) for name, v in both.items() if v[0]}
 
 
 def picked(ladder: Ladder, rungs: int) -> list[str]:
@@ -208,12 +172,12 @@ def _errors(found: Solved, reference: Solved) -> Errors:
 
 
 def _point(name: str, ladder: Ladder, rung: str, finest: bool, errors: Errors) -> dict[str, Any]:
-    short = {k: _number(v) for k, v in errors._asdict().items()}
+    short = {k: number(v) for k, v in errors._asdict().items()}
     return {"scene": name, "ladder": ladder.name, "level": rung, "kind": ladder.kind,
             "finest": finest, "errors": short}  # fmt: skip
 
 
-def _number(v: float | None) -> float | str | None:
+def number(v: float | None) -> float | str | None:
     """Four digits; infinity as a word, since JSON has none."""
     if v is None:
         return None

@@ -66,12 +66,6 @@ def inputs(full: Full) -> Inputs:
 def part(name: Part, full: Full, levels: Levels, given: Inputs) -> tuple[Callable, tuple] | None:
     """A part at these levels: a function and its arguments; None where the scene has no such part.
 
-    Args:
-        name: of the part.
-        full: the scene at its finest.
-        levels: -
-        given: see `inputs`.
-
     Raises:
         ValueError: another word.
     """

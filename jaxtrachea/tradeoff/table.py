@@ -16,12 +16,7 @@ _TIMES = {"part": "part", "call": "call", "part_lane": "part, lane", "gradient":
 
 
 def measured_table(points: list[dict[str, Any]], title: str = "") -> Table:
-    """A row of each level: errors, median seconds of a call of its programs, and of compiling.
-
-    Args:
-        points: as `measure` makes them, without those left out.
-        title: above it.
-    """
+    """A row of each level: errors, median seconds of a call of its programs, and of compiling."""
     errors = (
         Column(name.replace("_mm", " [mm]"), f"error_{name}", digits=2, null="-")
         for name in ("force", "joints", "surface", "contact_mm", "gradient")

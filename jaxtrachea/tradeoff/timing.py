@@ -47,13 +47,7 @@ class Compiled(NamedTuple):
 
 
 def compiled(full: Full, levels: Levels, settings: Settings) -> Compiled:
-    """The program of one pose, and those beside it.
-
-    Args:
-        full: the scene at its finest.
-        levels: of the program.
-        settings: which programs.
-    """
+    """The program of one pose, and those beside it."""
     scene, material, whole = program(full, levels)
     row = last_row(whole)
     start = time.perf_counter()

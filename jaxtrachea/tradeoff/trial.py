@@ -30,12 +30,7 @@ class Trial:
     """
 
     def __init__(self, full: Full, report: Callable[[str], None] = lambda text: None):
-        """Run the full program.
-
-        Args:
-            full: the scene at its finest.
-            report: called with what is tried next; may raise to stop.
-        """
+        """Run the full program."""
         self.full, self.report = full, report
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}

@@ -108,10 +108,6 @@ def _from_touch(stack: Stack, noise: np.ndarray) -> tuple[Stack, np.ndarray]:
     A trial begins in air, or as softly, where its force hardly grows over the first tenth of its
     travel. It is counted from where its force leaves that of the air, and only beyond.
 
-    Args:
-        stack: the trials.
-        noise: (G,) N, of a sample.
-
     Returns:
         The trials, and which groups have some in air.
     """

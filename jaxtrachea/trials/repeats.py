@@ -28,7 +28,6 @@ def trial_sentences(
     """What a fit says of its curves against each other.
 
     Args:
-        curves: as they are used.
         found: their `differing_trials`, where these are known.
         weighed: whether each counts by its own noise, so that noise that differs is no matter.
     """

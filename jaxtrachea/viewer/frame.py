@@ -103,10 +103,6 @@ def statuses() -> dict[int, list]:
 def read_pose(text: str, tools: int) -> tuple[int, np.ndarray] | None:
     """A tool and its pose, `{"tool": 0, "pose": [12 numbers]}`; None: a frame is acknowledged.
 
-    Args:
-        text: that a page sends.
-        tools: how many the scene has.
-
     Raises:
         ValueError: any other text, no such tool, numbers that are too large or not finite, or no
             rotation.

@@ -44,7 +44,6 @@ class Live(Worker):
         """Nothing is read yet.
 
         Args:
-            path: of the scene file.
             set_up: called by the thread before it reads.
         """
         super().__init__(path.name)

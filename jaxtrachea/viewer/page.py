@@ -35,7 +35,6 @@ def serve_scene(
     """Serve the page of a scene until Ctrl-C.
 
     Args:
-        path: of the scene file.
         port: see `serve`.
         opened: likewise.
         set_up: called by the thread of the session before it reads.

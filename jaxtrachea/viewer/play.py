@@ -53,7 +53,6 @@ def of_file(path: Path, title: str = "") -> str:
     """The page of a `simulation.h5`.
 
     Args:
-        path: of the file.
         title: of the page; empty: the name of the file.
 
     Raises:

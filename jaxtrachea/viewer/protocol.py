@@ -82,7 +82,6 @@ def tools_packet(
     """What a page must know before the first frame: the wall, the tools and where they are.
 
     Args:
-        title: of the scene.
         names: of the tools.
         tools: about their origins; None: there is none to see.
         poses: of the tools; shape (tools, 12).

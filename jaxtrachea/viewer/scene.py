@@ -60,10 +60,6 @@ def read_handled(path: Path, begin: Callable[[str], None] = lambda _: None) -> H
     pose alone. With a coefficient of friction, of a bonded tool, and where the force relaxes, it is
     `fixed`, as docs/haptics.md has it.
 
-    Args:
-        path: of the scene (TOML).
-        begin: called with the name of each stage of the work.
-
     Raises:
         SpecError: a file or a value that cannot be used, with its key.
     """

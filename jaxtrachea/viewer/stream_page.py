@@ -28,14 +28,7 @@ def serve_stream(
     port: int,
     opened: Callable[[str], None],
 ) -> None:
-    """Serve the page of an experiment until Ctrl-C.
-
-    Args:
-        name: of the file.
-        make: see `Stream`.
-        port: see `serve`.
-        opened: likewise.
-    """
+    """Serve the page of an experiment until Ctrl-C."""
     serve(name, StreamPage, Stream(name, make), port, opened)
 
 

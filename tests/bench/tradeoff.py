@@ -76,12 +76,13 @@ def cheapest(name: str, full) -> list:
 def choices(name: str, full, settings) -> tuple[list[dict], list]:
     """Rows of the table of choices of one scene, and the choices."""
     import jax
+    from tradeoff_page import choice_row
 
     from jaxtrachea.tradeoff.calls import turn_medians
     from jaxtrachea.tradeoff.cost import Cost, compiled
     from jaxtrachea.tradeoff.levels import program
     from jaxtrachea.tradeoff.load import Load
-    from jaxtrachea.tradeoff.measure import choice_row, environment
+    from jaxtrachea.tradeoff.measure import environment
 
     found = cheapest(name, full)
     say(f"{name}: choice: timing")

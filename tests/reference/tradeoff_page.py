@@ -7,7 +7,9 @@ from typing import Any
 from tradeoff_front import front, worst
 from tradeoff_text import measured, micro, scene_text, table
 
-from jaxtrachea.tradeoff.cost import HALF
+from jaxtrachea.tradeoff.choice import Choice
+from jaxtrachea.tradeoff.cost import HALF, Cost
+from jaxtrachea.tradeoff.measure import number
 
 #: Largest error of the plans of a front, for each pair of columns: those of use, and all.
 WITHIN = (0.1, float("inf"))
@@ -21,6 +23,27 @@ CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came b
 def read(path: Path) -> list[dict[str, Any]]:
     """The lines of a file of JSON lines."""
     return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+
+
+def choice_row(name: str, choice: Choice, repeat: Cost, end: dict[str, Any]) -> dict[str, Any]:
+    """A choice as a line of JSON."""
+
+    def said(rungs):
+        return [
+            {"ladder": r.ladder, "level": r.level, "error": number(r.errors.worst)} for r in rungs
+        ]
+
+    def short(cost):
+        return {k: number(v) for k, v in cost._asdict().items()}
+
+    return {
+        "scene": name, "tolerance": choice.tolerance, "by": choice.by,
+        "dropped": said(choice.dropped), "refused": said(choice.refused),
+        "returned": said(choice.restored), "idle": said(choice.no_gain),
+        "errors": {k: number(v) for k, v in choice.errors._asdict().items()},
+        "cost": short(choice.cost), "operations": round(choice.operations, 4),
+        "repeat": short(repeat),
+    } | end  # fmt: skip
 
 
 def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:

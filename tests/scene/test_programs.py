@@ -30,7 +30,6 @@ from jaxtrachea.mechanics.press import indentation as first_touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.lumen import in_lumen
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import (
     hidden_rows,
@@ -43,6 +42,7 @@ from jaxtrachea.scene.stage import Tool, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
+from jaxtrachea.tradeoff.operations import count_operations
 
 
 def by_hand(more="joints loads end_U end_V", surface=False, **how):

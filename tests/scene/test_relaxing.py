@@ -13,8 +13,8 @@ from small_scenes import BALL, BARE, MATERIAL, OUTER, SPRINGS, TUBE
 
 import jaxtrachea as jt
 from jaxtrachea.mechanics.levels.level import Motion
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.status import PressStatus
+from jaxtrachea.tradeoff.operations import count_operations
 
 pytestmark = [pytest.mark.long, pytest.mark.compiling]
 

@@ -14,12 +14,12 @@ from jaxtrachea.mechanics.sections.section import (
     Shape,
     deform,
     energy,
+    line_motion,
     make_grid,
-    surface_motion,
 )
 from jaxtrachea.mechanics.sections.section_tangent import (
-    ring_forces,
-    ring_tangent,
+    line_forces,
+    line_tangent,
     surface_tangent,
 )
 from jaxtrachea.mechanics.sections.span import linear_shapes
@@ -43,6 +43,10 @@ def parts(midline, dtype="float64"):
 def sample(midline, size=2.0, count=3):
     q = np.random.default_rng(1).normal(size=(count, 8)) * size
     return q[:, :4] if midline else q
+
+
+def surface_motion(q, phi, grid, shape):
+    return line_motion(deform(q, grid, shape), phi, grid, shape)
 
 
 def brute_force(q, phi_c):
@@ -118,8 +122,8 @@ def test_forces_and_stiffness_are_the_derivatives_of_the_energy():
         return energy(q, *parts_)
 
     q = jnp.asarray(sample(False))
-    force, stiff = jax.jit(jax.vmap(lambda q: ring_tangent(q, *parts_)))(q)
-    alone = jax.jit(jax.vmap(lambda q: ring_forces(q, *parts_)))(q)
+    force, stiff = jax.jit(jax.vmap(lambda q: line_tangent(deform(q, *parts_[1:]), *parts_)))(q)
+    alone = jax.jit(jax.vmap(lambda q: line_forces(deform(q, *parts_[1:]), *parts_)))(q)
     by_ad = jax.jit(jax.vmap(lambda q: (jax.grad(U)(q), jax.hessian(U)(q))))(q)
     np.testing.assert_allclose(force, by_ad[0], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(alone, force, rtol=1e-12, atol=1e-12)
@@ -153,7 +157,9 @@ def test_small_motions():
     ring, grid, shape = parts(False)
     n = grid.modes
     p = VALUES | {"R": R, "alpha": ALPHA, "offset": OFFSET}
-    _, stiff = jax.jit(lambda q: ring_tangent(q, ring, grid, shape))(jnp.zeros(n))
+    _, stiff = jax.jit(lambda q: line_tangent(deform(q, grid, shape), ring, grid, shape))(
+        jnp.zeros(n)
+    )
     np.testing.assert_allclose(stiff, ring_stiffness(p, PITCH)[:n, :n], rtol=1e-9, atol=1e-8)
     phi = np.array([-1.9, -0.4, 0.0, 1.1])
     r, t, turn, _ = shapes(phi, R, ALPHA)

@@ -86,7 +86,6 @@ def analyse(
 
     Args:
         request: what is asked for, as `refuse` lets it pass.
-        result: the fit.
         begin: called with what is done next; returns whom to tell of its progress.
     """
     findings = AnalysisResults(result)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.fitting.assessment import assess
-from jaxtrachea.fitting.effective import CORRELATED, Effective
+from jaxtrachea.fitting.effective import CORRELATED
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import determined_unknowns, lane_label
 from jaxtrachea.inference.residuals import where_missed
@@ -43,17 +43,12 @@ def _cells(found: AnalysisResults, lane: int, i: int) -> Cells:
     }
 
 
-def _correlated(wide: Effective) -> np.ndarray:
-    return np.flatnonzero((wide.correlation > CORRELATED) & ~wide.misses)
-
-
 def _sentences(found: AnalysisResults) -> Iterator[str]:
     """Lanes whose intervals grow, and those of which nothing can be said."""
     result = found.result
     wide, every = result.effective, result.lanes
-    lanes = _correlated(wide)
-    if not result.study.free:
-        lanes = np.flatnonzero(wide.correlation > CORRELATED)
+    missed = wide.misses if result.study.free else False
+    lanes = np.flatnonzero((wide.correlation > CORRELATED) & np.logical_not(missed))
     if len(lanes):
         said = (
             f"Neighbouring force residuals are correlated in {len(lanes)} of {every} fits (median "

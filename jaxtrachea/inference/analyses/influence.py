@@ -142,11 +142,11 @@ def sample_label(found: Influence, lane: int, t: int, entry: int) -> str:
     return place.label(float(study.curves[lane][t].displacement[place.sample]))
 
 
-def influence_table(found: Influence, most: int = ONE_BY_ONE) -> Table:
+def influence_table(found: Influence) -> Table:
     """Curves: all of few; of many those with the largest Cook's distance."""
     names = [p.name for p in found.result.study.free]
     head = ["specimen", "curve", *(f"{n}: share, left out" for n in names), "Cook"]
-    rows = [_curve_row(found, *place) for place in _top_curves(found, most)]
+    rows = [_curve_row(found, *place) for place in _top_curves(found, ONE_BY_ONE)]
     total = sum(map(len, found.result.study.curves))
     table = words("Influence of curves", head, rows)
     table.more = and_more(total, len(rows), "influence_curves.csv")

@@ -97,11 +97,6 @@ def _section(posterior: Posterior) -> list[str]:
     ]
 
 
-def _poor(posterior: Posterior) -> bool:
-    """Whether some lane's chains are poor."""
-    return any(posterior.verdict(lane).startswith("poor") for lane in range(posterior.result.lanes))
-
-
 POSTERIOR = Analysis(
     name="posterior",
     after="population",
@@ -111,21 +106,12 @@ POSTERIOR = Analysis(
     refuse=_refuse,
     parameter_cells=_cells,
     datasets=(
-        "theta",
-        "sigma",
-        "divergent",
-        "steps",
-        "lost",
-        "rhat",
-        "ess",
-        "median",
-        "lower",
-        "upper",
-    ),  # fmt: skip
+        "theta", "sigma", "divergent", "steps", "lost", "rhat", "ess", "median", "lower", "upper",
+    ),
     report_section="data",
     table=posterior_table,
     section=_section,
     warning=distrust,
     files={"posterior.nc": write_posterior},
-    unreliable=_poor,
-)
+    unreliable=lambda found: any(text.startswith("poor") for text in not_good(found).values()),
+)  # fmt: skip

@@ -205,16 +205,7 @@ PROFILES = Analysis(
     refuse=_refuse,
     tables=lambda found: {"profiles.csv": Table(profile_rows(found))},
     parameter_cells=_cells,
-    datasets=(
-        "lane",
-        "unknown",
-        "lower",
-        "upper",
-        "threshold",
-        "theta",
-        "statistic",
-        "end",
-    ),  # fmt: skip
+    datasets=("lane", "unknown", "lower", "upper", "threshold", "theta", "statistic", "end"),
     meanings={"end": ProfileEnd},
     table=profile_table,
     section=_section,

@@ -97,7 +97,6 @@ def reached(study: Study, touch: Float[np.ndarray, "lanes T"] | None = None) -> 
     """Least and largest depth of the curves, mm from first touch.
 
     Args:
-        study: the study.
         touch: as `FitResult.first_touch`; None: as `Study.first_touch` has it before a fit.
     """
     options = study.model.options
@@ -115,7 +114,6 @@ def extrapolation(study: Study, depth: float, reach: tuple[float, float] | None 
     """What of a press goes deeper than the curves did, or the model was tested; "" if nothing.
 
     Args:
-        study: the study.
         depth: mm from first touch.
         reach: of the curves, as `reached` has it of the fit; None: as before a fit.
     """
@@ -149,11 +147,6 @@ def candidates_of(
 
     From ring to ring as far as all of the tool lies on the tube; of deforming cross-sections at
     every angle that was measured; on every specimen that has unknowns of its own.
-
-    Args:
-        spec: the specification.
-        study: the study.
-        reach: as in `extrapolation`.
 
     Raises:
         SpecError: as `_paces`; positions outside the tube or where the tool reaches beyond its
@@ -194,12 +187,7 @@ def candidates_of(
 def _paces(
     speed: tuple[float, ...] | None, hold: tuple[float, ...] | None, study: Study
 ) -> list[_Pace]:
-    """Every speed with every hold; left out: the slowest and the fastest, the longest measured.
-
-    Raises:
-        SpecError: of a model that knows no time; no speed where the records have none; a hold that
-            is negative.
-    """
+    """Every speed with every hold; left out: the slowest and the fastest, the longest measured."""
     if not study.model.relaxes:
         for key, given in (("speed", speed), ("hold", hold)):
             if given is not None:
@@ -226,7 +214,6 @@ def beyond_records(study: Study, speed: float, hold: float, depth: float) -> str
     """Whether a press of so long is longer than the records; "" if not.
 
     Args:
-        study: the study.
         speed: mm/s.
         hold: s.
         depth: mm from first touch.
@@ -238,11 +225,7 @@ def beyond_records(study: Study, speed: float, hold: float, depth: float) -> str
 
 
 def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
-    """Angles of the candidates, rad, each once.
-
-    Raises:
-        SpecError: one that the model does not press.
-    """
+    """Angles of the candidates, rad, each once."""
     if not study.model.level.off_midline:
         if asked is not None:
             raise SpecError(

@@ -20,9 +20,10 @@ import importlib
 import json
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,10 +40,10 @@ from jaxtrachea.measurements.readers.cells import numbers
 from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric, unit_of
 from jaxtrachea.measurements.readers.reader import Reader
-from jaxtrachea.measurements.readers.recognise import AFM
+from jaxtrachea.measurements.readers.recognise import AFM, HDF5
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.table import Header, Text, rows_below
-from jaxtrachea.measurements.readers.text_file import read_bytes, to_utf8
+from jaxtrachea.measurements.readers.text_file import first_bytes, read_bytes, to_utf8
 from jaxtrachea.units import convert
 
 # afmformats fixes the unit of each column to SI; its tab files do not repeat it.
@@ -57,12 +58,30 @@ SI_UNITS = {
 }
 
 
+class _Stored(NamedTuple):
+    """A curve as its file has it.
+
+    Attributes:
+        columns: by name, in file units.
+        units: of the columns.
+        metadata: with the spring constant, if it is known.
+        rows: numbers of the samples; None: counted from 1.
+    """
+
+    columns: Mapping[str, np.ndarray]
+    units: Mapping[str, str | None]
+    metadata: Mapping[str, Any]
+    rows: np.ndarray | None = None
+
+
+#: Number of a curve, where it stands, and what reads it.
+_Found = Iterator[tuple[str, str, Callable[[], _Stored]]]
+
+
 def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read the curves of an afmformats file; `columns.displacement` may name another height column.
 
-    Args:
-        path: the file: of an instrument by its name, else HDF5 or tab by content.
-        options: naming, loading rule, columns.
+    The file is one of an instrument by its name, else HDF5 or tab by content.
 
     Returns:
         One record per curve, in the order of their numbers.
@@ -72,10 +91,33 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """
     who = identify_file(path, options)
     if path.suffix.lower() in AFM:
-        return _read_instrument(path, who, options)
-    with path.open("rb") as stream:
-        is_hdf5 = stream.read(8) == b"\x89HDF\r\n\x1a\n"
-    return _read_hdf5(path, who, options) if is_hdf5 else [_read_tab(path, who, options)]
+        return _records(_of_instrument(path, options), who, options)
+    if first_bytes(path, len(HDF5)) != HDF5:
+        tab = iter([("0", str(path), partial(_of_tab, path, options))])
+        return _records(tab, who, options)
+    with opened(path) as file:
+        if found := _records(_of_hdf5(path, file, options), who, options):
+            return found
+    raise DataError(
+        "no groups 0, 1, ... as afmformats writes them",
+        place=str(path),
+        cure="export the file again",
+    )
+
+
+def _records(found: _Found, who: FileIdentity, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    """A record of each curve; the trial of the file's name, with the number of one of several."""
+    records: list[RawCurve | BadCurve] = []
+    curves = list(found)
+    for number, source, stored in curves:
+        trial = who.trial or number
+        if who.trial and len(curves) > 1:
+            trial = f"{who.trial}-{number}"
+        try:
+            records.append(_curve(stored(), who, trial, source, options))
+        except Fault as fault:
+            records.append(bad(who.specimen, trial, source, fault))
+    return records
 
 
 def load(path: Path) -> list[Any]:
@@ -111,104 +153,54 @@ def load(path: Path) -> list[Any]:
     return curves
 
 
-def _read_instrument(
-    path: Path, who: FileIdentity, options: ReadOptions
-) -> list[RawCurve | BadCurve]:
+def _of_instrument(path: Path, options: ReadOptions) -> _Found:
     """The curves of a file that afmformats reads; it gives SI units."""
-    found: list[RawCurve | BadCurve] = []
-    curves = load(path)
-    for number, curve in enumerate(curves):
-        own = str(number)
-        trial = own if who.trial is None else f"{who.trial}-{own}" if len(curves) > 1 else who.trial
-        source = f"{path}:{number}"
-        held = [name for name in curve.columns if name in _wanted(options)]
-        columns = {name: np.asarray(curve[name], np.float64) for name in held}
-        units = {name: SI_UNITS.get(name) for name in columns}
+
+    def stored(curve: Any) -> _Stored:
+        names = [name for name in curve.columns if name in _wanted(options)]
+        columns = {name: np.asarray(curve[name], np.float64) for name in names}
         metadata = {"spring constant": curve.metadata.get("spring constant")}
-        rows = np.arange(1, columns["force"].size + 1) if "force" in columns else np.zeros(0)
-        try:
-            place = (who, trial, source)
-            found.append(_curve(columns, units, metadata, rows, "sample", place, options))
-        except Fault as fault:
-            found.append(bad(who.specimen, trial, source, fault))
-    return found
+        return _Stored(columns, {name: SI_UNITS.get(name) for name in columns}, metadata)
+
+    for number, curve in enumerate(load(path)):
+        yield str(number), f"{path}:{number}", partial(stored, curve)
 
 
-def _read_hdf5(path: Path, who: FileIdentity, options: ReadOptions) -> list[RawCurve | BadCurve]:
-    found: list[RawCurve | BadCurve] = []
-    with opened(path) as file:
-        names = sorted((name for name in file if re.fullmatch(r"\d{1,9}", name)), key=int)
-        for name in names:
-            source = f"{path}:/{name}"
-            trial = (
-                name
-                if who.trial is None
-                else who.trial
-                if len(names) == 1
-                else f"{who.trial}-{name}"
-            )
-            group = file[name]
-            try:
-                if not hasattr(group, "items"):
-                    raise Fault("shape", "is a dataset, expected a group", "export the file again")
-                columns = {key: numeric(group, key) for key in group if key in _wanted(options)}
-                units = {key: unit_of(group, key) for key in columns}
-                metadata = {"spring constant": attribute(group, "spring constant")}
-                rows = (
-                    np.arange(1, columns["force"].size + 1) if "force" in columns else np.zeros(0)
-                )
-                found.append(
-                    _curve(
-                        columns,
-                        units,
-                        metadata,
-                        rows,
-                        "sample",
-                        (who, trial, source),
-                        options,
-                    )
-                )
-            except Fault as fault:
-                found.append(bad(who.specimen, trial, source, fault))
-    if not found:
-        raise DataError(
-            "no groups 0, 1, ... as afmformats writes them",
-            place=str(path),
-            cure="export the file again",
-        )
-    return found
+def _of_hdf5(path: Path, file: Any, options: ReadOptions) -> _Found:
+    """The numbered groups of an open file."""
+
+    def stored(group: Any) -> _Stored:
+        if not hasattr(group, "items"):
+            raise Fault("shape", "is a dataset, expected a group", "export the file again")
+        columns = {key: numeric(group, key) for key in group if key in _wanted(options)}
+        units = {key: unit_of(group, key) for key in columns}
+        return _Stored(columns, units, {"spring constant": attribute(group, "spring constant")})
+
+    for name in sorted((name for name in file if re.fullmatch(r"\d{1,9}", name)), key=int):
+        yield name, f"{path}:/{name}", partial(stored, file[name])
 
 
-def _read_tab(path: Path, who: FileIdentity, options: ReadOptions) -> RawCurve | BadCurve:
-    trial = who.trial or "0"
-    source = str(path)
-    try:
-        header, metadata, text = _tab_head(path)
-        table = rows_below(text, header)
-        wanted = [i for i, name in enumerate(header.names) if name in _wanted(options)]
-        table.load(wanted)
-        columns = {}
-        for i in wanted:
-            values = table.raw(i)
-            if not isinstance(values, np.ndarray):
-                cells = [*map(_truth, values)]
-                values = numbers(cells, table.lines, header.names[i], ",")
-            columns[header.names[i]] = values
-        units = {name: SI_UNITS.get(name) for name in columns}
-        place = (who, trial, source)
-        return _curve(columns, units, metadata, table.lines, "line", place, options)
-    except Fault as fault:
-        return bad(who.specimen, trial, source, fault)
+def _of_tab(path: Path, options: ReadOptions) -> _Stored:
+    """The only curve of a tab file."""
+    header, metadata, text = _tab_head(path)
+    table = rows_below(text, header)
+    wanted = [i for i, name in enumerate(header.names) if name in _wanted(options)]
+    table.load(wanted)
+    columns = {}
+    for i in wanted:
+        values = table.raw(i)
+        if not isinstance(values, np.ndarray):
+            cells = [{"True": "1", "False": "0"}.get(cell, cell) for cell in values]
+            values = numbers(cells, table.lines, header.names[i], ",")
+        columns[header.names[i]] = values
+    units = {name: SI_UNITS.get(name) for name in columns}
+    return _Stored(columns, units, metadata, table.lines)
 
 
 def _wanted(options: ReadOptions) -> set[str]:
     chosen = {options.columns[r] for r in ("displacement", "force") if r in options.columns}
     timed = {"time"} if options.loading == "record" else set()
     return {"force", "height (measured)", "tip position", "segment"} | chosen | timed
-
-
-def _truth(cell: str) -> str:
-    return {"True": "1", "False": "0"}.get(cell, cell)
 
 
 def _tab_head(path: Path) -> tuple[Header, Mapping[str, Any], Text]:
@@ -259,18 +251,15 @@ def _split_glued(cells: list[str]) -> tuple[list[str], str]:
 
 
 def _curve(
-    columns: Mapping[str, np.ndarray],
-    units: Mapping[str, str | None],
-    metadata: Mapping[str, Any],
-    rows: np.ndarray,
-    row_word: str,
-    place: tuple[FileIdentity, str, str],
-    options: ReadOptions,
+    stored: _Stored, who: FileIdentity, trial: str, source: str, options: ReadOptions
 ) -> RawCurve:
-    """Force and tip displacement of one curve, from its columns in file units."""
-    who, trial, source = place
-    force = _column(options.columns.get("force", "force"), "force", columns, units, source, options)
-    position = _tip_position(force, columns, units, metadata, source, options)
+    """Force and tip displacement of one curve."""
+    columns = stored.columns
+    force = _column(options.columns.get("force", "force"), "force", stored, source, options)
+    position = _tip_position(force, stored, source, options)
+    word, rows = "line", stored.rows
+    if rows is None:
+        word, rows = "sample", np.arange(1, force.size + 1)
     keep = np.ones(force.shape, dtype=bool)
     if "segment" in columns and options.loading not in ("all", "record"):
         if columns["segment"].shape != force.shape:
@@ -281,32 +270,27 @@ def _curve(
     time = None
     if options.loading == "record" and "time" in columns:
         name = options.columns.get("time", "time")
-        time = np.atleast_1d(convert(columns[name], units[name] or "s", "time"))
+        time = np.atleast_1d(convert(columns[name], stored.units[name] or "s", "time"))
     return RawCurve(
-        who.specimen, trial, source, displacement, force, rows, row_word, s=who.s, phi=who.phi,
+        who.specimen, trial, source, displacement, force, rows, word, s=who.s, phi=who.phi,
         time=time,
     )  # fmt: skip
 
 
 def _tip_position(
-    force: np.ndarray,
-    columns: Mapping[str, np.ndarray],
-    units: Mapping[str, str | None],
-    metadata: Mapping[str, Any],
-    source: str,
-    options: ReadOptions,
+    force: np.ndarray, stored: _Stored, source: str, options: ReadOptions
 ) -> np.ndarray:
     """Position of the tip, mm, falling towards the sample: h + F/k, or as the file gives it."""
-    default = "tip position" if "tip position" in columns else "height (measured)"
+    default = "tip position" if "tip position" in stored.columns else "height (measured)"
     name = options.columns.get("displacement", default)
-    length = _column(name, "displacement", columns, units, source, options)
+    length = _column(name, "displacement", stored, source, options)
     if length.shape != force.shape:
         raise Fault(
             "shape", f"force {force.shape} and {name} {length.shape} differ", "export again"
         )
     if "height" not in name:
         return length
-    spring = metadata.get("spring constant")
+    spring = stored.metadata.get("spring constant")
     if not isinstance(spring, (int, float, np.number)) or not 0 < spring < 1e9:
         raise Fault(
             "metadata_missing",
@@ -316,22 +300,17 @@ def _tip_position(
     return length + force / convert(float(spring), "N/m", "stiffness")
 
 
-def _column(
-    name: str,
-    role: str,
-    columns: Mapping[str, np.ndarray],
-    units: Mapping[str, str | None],
-    source: str,
-    options: ReadOptions,
-) -> np.ndarray:
-    if name not in columns:
+def _column(name: str, role: str, stored: _Stored, source: str, options: ReadOptions) -> np.ndarray:
+    if name not in stored.columns:
         raise Fault(
             "column_missing",
-            f"no column {name!r}; there are {sorted(columns)}",
+            f"no column {name!r}; there are {sorted(stored.columns)}",
             "export it as well",
         )
-    unit = resolve_unit(role, units[name], options, f"{source}/{name}")
-    return np.atleast_1d(convert(columns[name], unit, "force" if role == "force" else "length"))
+    unit = resolve_unit(role, stored.units[name], options, f"{source}/{name}")
+    return np.atleast_1d(
+        convert(stored.columns[name], unit, "force" if role == "force" else "length")
+    )
 
 
 AFMFORMATS = Reader(

@@ -39,11 +39,7 @@ USUAL = {
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
-    """Name and unit of a column by its cell in the header, ``Load [N]`` or ``Load N``.
-
-    Args:
-        cell: of the header.
-    """
+    """Name and unit of a column by its cell in the header, ``Load [N]`` or ``Load N``."""
     name, unit = column_unit(cell)
     head, _, tail = name.rpartition(" ")
     if unit is None and head.lower() in _NAMES and is_unit(tail) and not tail.isdigit():

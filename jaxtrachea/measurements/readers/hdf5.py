@@ -54,7 +54,6 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read every curve; a fault in the values of one costs this curve only.
 
     Args:
-        path: the file.
         options: units for datasets that have none.
 
     Returns:
@@ -76,11 +75,7 @@ def limits_of(file: Any) -> Limits:
 
 
 def _check_version(path: Path, file: Any) -> None:
-    """Refuse other schemas and versions.
-
-    Raises:
-        DataError: the file is of another schema or version, or does not say.
-    """
+    """Refuse other schemas and versions."""
     try:
         schema, version = text_attribute(file, "schema"), attribute(file, "schema_version")
     except Fault as fault:
@@ -148,11 +143,7 @@ class _Pieces:
 
 
 def _fields(samples: dict[str, _Pieces], i: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Fields of one curve; a quantity without values is not there.
-
-    Raises:
-        Fault: values of several rings that do not come to the same number for every sample.
-    """
+    """Fields of one curve; a quantity without values is not there."""
     count = samples["displacement"][i].size
     for name, pieces in samples.items():
         values = pieces[i]

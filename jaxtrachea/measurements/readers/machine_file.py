@@ -21,10 +21,6 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
 
     Repeated rows and initial offsets are left as they are.
 
-    Args:
-        text: of the file.
-        options: columns, units and naming.
-
     Returns:
         One record for each block of rows, and for each pair of columns side by side.
 

@@ -54,9 +54,6 @@ class Found(NamedTuple):
 def find_header(text: Text, options: ReadOptions) -> tuple[Found, list[Part]]:
     """The header: the first line, by any delimiter, that names displacement and force.
 
-    Returns:
-        The header, and the trials that stand side by side below it.
-
     Raises:
         Fault: there is none, or it names a role twice.
     """
@@ -117,7 +114,7 @@ def _search(
                 if fault.kind == "ambiguous" or _names_both(header, options):
                     reason = fault
                 continue
-            if _is_labview(text):
+            if text.head[0].text.startswith("LabVIEW Measurement"):
                 header = _with_labels(header, lines[:at])
             found = columns_of_tidy(parts[0].roles, header.units)
             quoted = {role: repr(header.names[parts[0].roles[role]]) for role in found}
@@ -181,11 +178,7 @@ def _titled(parts: list[Part], above: Line | None, delimiter: str) -> list[Part]
 
 
 def _numbered(text: Text, options: ReadOptions) -> tuple[Found, list[Part]]:
-    """Columns by number where there is no header.
-
-    Raises:
-        Fault: there is a header, or nobody says which columns are displacement and force.
-    """
+    """Columns by number where there is no header."""
     named = likely_header(text.lines[:MAX_PREAMBLE])
     for version in (text, text.with_tabs(1)):
         header = numbered_columns(version.lines[:MAX_PREAMBLE])
@@ -246,15 +239,6 @@ def _refuse_columns_of_tidy(
 
     With `format = "machine"` those that the options name; else all: other lines stand above, by
     which the file is no tidy table.
-
-    Args:
-        line: of the header.
-        quoted: their names, by role.
-        options: as the file is read.
-        commented: the header begins with #.
-
-    Raises:
-        Fault: there is one.
     """
     asked = options.format == "machine"
     found = {role: name for role, name in quoted.items() if not asked or role in options.columns}
@@ -277,10 +261,6 @@ def _refuse_columns_of_tidy(
         f'{cure}, or set format = "machine": one curve, of which the name of the file tells '
         "specimen, trial and position",
     )
-
-
-def _is_labview(text: Text) -> bool:
-    return bool(text.head) and text.head[0].text.startswith("LabVIEW Measurement")
 
 
 def _with_labels(header: Header, above: Sequence[Line]) -> Header:

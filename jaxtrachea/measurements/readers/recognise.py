@@ -35,9 +35,6 @@ SIGNATURES: tuple[tuple[bytes, str, str], ...] = (
 def kind_of(path: Path) -> str:
     """What can be read of a file.
 
-    Args:
-        path: an existing file.
-
     Returns:
         "hdf5", "xlsx", "afm" or "text" (which may be packed by gzip).
 

@@ -44,14 +44,10 @@ def opened(
     """Open an HDF5 file for reading after walking through all of it.
 
     Args:
-        path: the file.
         audit: walk through it; without that only names may be asked for, no value be read.
         read: groups and datasets, from the root, whose values will be read; None: all. Others may
             hold text, and as much as they like.
         limits: of a file, by the names in it.
-
-    Yields:
-        The open `h5py.File`.
 
     Raises:
         DataError: not HDF5, truncated, damaged, or refused for what it contains.

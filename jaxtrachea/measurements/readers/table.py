@@ -422,11 +422,7 @@ def _is_odd(
 
 
 def _is_row(line: Line, header: Header, word: str) -> bool:
-    """Whether a line is a row, and no comment or empty.
-
-    Raises:
-        Fault: it has not as many cells as the header, or quotes do not match.
-    """
+    """Whether a line is a row, and no comment or empty."""
     if is_comment(line.text):
         return False
     try:

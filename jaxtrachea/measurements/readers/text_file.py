@@ -7,7 +7,6 @@ from pathlib import Path
 from jaxtrachea.measurements.curve import DataError
 
 MAX_TEXT_BYTES = 256 * 2**20
-BLOCK = 2**20
 GZIP = b"\x1f\x8b"
 _MARKS = (b"\xff\xfe", b"\xfe\xff")
 
@@ -22,7 +21,9 @@ def first_bytes(path: Path, count: int) -> bytes:
         with path.open("rb") as stream:
             return stream.read(count)
     except OSError as error:
-        raise _unreadable(path, error) from None
+        raise DataError(
+            f"cannot be read ({error.strerror})", place=str(path), cure="check the permissions"
+        ) from None
 
 
 def first_unpacked(path: Path, count: int) -> bytes:
@@ -35,16 +36,30 @@ def first_unpacked(path: Path, count: int) -> bytes:
         with gzip.open(path) as stream:
             return stream.read(count)
     except (OSError, EOFError, zlib.error) as error:
-        raise _damaged_gzip(path, error) from None
+        # BadGzipFile is an OSError, but its reason is in its text.
+        raise DataError(
+            f"a gzip file, cut off or damaged ({str(error)[:80]})",
+            place=str(path),
+            cure="copy or pack it again",
+        ) from None
 
 
 def read_bytes(path: Path) -> bytes:
-    """Bytes of a text file; one packed by gzip is unpacked in memory.
+    """Bytes of a text file; one packed by gzip is unpacked in memory, within the same bound.
 
     Raises:
         DataError: the file is too large, packed or unpacked, or unreadable or damaged.
     """
-    return _unpacked(path) if first_bytes(path, 2) == GZIP else _bytes(path)
+    packed = first_bytes(path, 2) == GZIP
+    data = (first_unpacked if packed else first_bytes)(path, MAX_TEXT_BYTES + 1)
+    if len(data) <= MAX_TEXT_BYTES:
+        return data
+    more = "unpacks to more" if packed else "more"
+    raise DataError(
+        f"{more} than {MAX_TEXT_BYTES} bytes of text, at most so many are read",
+        place=str(path),
+        cure="unpack it and split it, or use HDF5" if packed else "split it or use HDF5",
+    )
 
 
 def to_utf8(path: Path, data: bytes) -> bytes:
@@ -52,10 +67,6 @@ def to_utf8(path: Path, data: bytes) -> bytes:
 
     UTF-8 (with or without mark) and UTF-16 with one are decoded; other bytes are taken for Latin-1,
     in which many instruments write µ and °. Line ends may be those of Unix, DOS or old Macs.
-
-    Args:
-        path: the file, for messages.
-        data: the text.
 
     Raises:
         DataError: it holds zero bytes.
@@ -76,55 +87,3 @@ def to_utf8(path: Path, data: bytes) -> bytes:
             cure="export it as CSV in UTF-8, or as HDF5",
         )
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(MAX_TEXT_BYTES + 1)
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    if len(data) > MAX_TEXT_BYTES:
-        raise DataError(
-            f"more than {MAX_TEXT_BYTES} bytes of text, at most so many are read",
-            place=str(path),
-            cure="split it or use HDF5",
-        )
-    return data
-
-
-def _unpacked(path: Path) -> bytes:
-    """Content of a gzip file. It is unpacked twice: a bomb is refused before any of it is kept."""
-    try:
-        size = 0
-        with gzip.open(path) as stream:
-            while block := stream.read(BLOCK):
-                size += len(block)
-                if size > MAX_TEXT_BYTES:
-                    raise DataError(
-                        f"unpacks to more than {MAX_TEXT_BYTES} bytes of text, at most so "
-                        "many are read",
-                        place=str(path),
-                        cure="unpack it and split it, or use HDF5",
-                    )
-        with gzip.open(path) as stream:
-            return stream.read(size)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _damaged_gzip(path, error) from None
-
-
-def _unreadable(path: Path, error: OSError) -> DataError:
-    return DataError(
-        f"cannot be read ({error.strerror})",
-        place=str(path),
-        cure="check the permissions",
-    )
-
-
-def _damaged_gzip(path: Path, error: Exception) -> DataError:
-    # BadGzipFile is an OSError, but its reason is in its text.
-    return DataError(
-        f"a gzip file, cut off or damaged ({str(error)[:80]})",
-        place=str(path),
-        cure="copy or pack it again",
-    )

@@ -52,10 +52,6 @@ STEADY_CONDITION = 0.05
 def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read a tidy table; see docs/measurements.md for the format.
 
-    Args:
-        text: of the file.
-        options: columns, units and naming.
-
     Returns:
         One record per (specimen, trial) in file order.
 

@@ -35,7 +35,6 @@ def read_sheets(path: Path, sheet: str | Sequence[str] | None) -> tuple[list[Tex
     file does not store stands as its text, ``=B2*2``, which is no number.
 
     Args:
-        path: the workbook.
         sheet: name or pattern of the sheets, or several; None: the first that is not hidden.
 
     Returns:
@@ -90,11 +89,7 @@ def _cells(book: Any, name: str) -> list[tuple]:
 
 
 def _chosen(path: Path, pages: dict[str, str], sheet: str | Sequence[str] | None) -> list[str]:
-    """Names of the sheets that are meant, in the order of the workbook.
-
-    Raises:
-        DataError: there is none.
-    """
+    """Names of the sheets that are meant, in the order of the workbook."""
     if not pages:
         raise DataError(
             "has no sheet with cells",

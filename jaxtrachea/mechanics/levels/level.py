@@ -233,12 +233,7 @@ class Level(abc.ABC):
 
     @abc.abstractmethod
     def without_negative(self, material: Any, also: Iterable[str]) -> tuple[Any, Bool[Array, ""]]:
-        """Values that it can compute with, and whether a negative one was read.
-
-        Args:
-            material: as given.
-            also: names that are read beside those that the options read.
-        """
+        """Values that it can compute with, and whether a negative one was read."""
 
     @abc.abstractmethod
     def needs(self, *, joints: bool) -> frozenset[str]:
@@ -249,7 +244,6 @@ class Level(abc.ABC):
         """Why it cannot press a curve on the tube; None: it can.
 
         Args:
-            curve: as measured.
             size: of the tube.
             onset: displacement at first touch, mm: held there, or the first guess.
         """

@@ -129,7 +129,6 @@ def check_line(options: Options, what: str, *, timed: bool = False) -> None:
     """Refuse a skeleton of deforming cross-sections where a line of joints is pressed.
 
     Args:
-        options: of the press.
         what: was called.
         timed: whether time enters there; else a force that relaxes is refused.
 

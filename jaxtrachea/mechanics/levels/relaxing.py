@@ -32,11 +32,7 @@ class RelaxingMaterial(eqx.Module):
 
 
 def _as_arrays(given: Relaxation) -> Relaxation:
-    """Branches of numbers, lists or arrays.
-
-    Raises:
-        ValueError: what are no branches, or a number of times other than of strengths.
-    """
+    """Branches of numbers, lists or arrays."""
     check_word("relaxation", given, Relaxation)
 
     def arrays(name: str, part: Branches) -> Branches:

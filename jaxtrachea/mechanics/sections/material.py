@@ -214,11 +214,7 @@ class Wall:
     bed_t: float = 0.002
 
     def __post_init__(self):
-        """Refuse a wall that cannot be.
-
-        Raises:
-            InputError: naming the value.
-        """
+        """Refuse a wall that cannot be (`InputError`)."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name != "nu" and not (np.isfinite(value) and value > 0):
@@ -335,7 +331,6 @@ def furthest_proportion(geometry: Geometry, wall: Wall, tool_radius: float) -> s
     """The proportion that is least like the specimen's, in words; empty: `Factors` hold.
 
     Args:
-        geometry: the tube.
         wall: moduli and thicknesses.
         tool_radius: of the tool's flat end, mm.
     """
@@ -361,7 +356,6 @@ def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Arr
     the tool's radius.
 
     Args:
-        geometry: the tube.
         wall: moduli and thicknesses.
         tool_radius: of the tool's flat end, mm.
     """

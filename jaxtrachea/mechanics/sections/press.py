@@ -69,11 +69,7 @@ class SectionOptions:
     half_width: float = 0.0
 
     def __post_init__(self):
-        """Refuse a width that none is.
-
-        Raises:
-            ValueError: naming the option, what was found and what is expected.
-        """
+        """Refuse a width that none is (`ValueError`)."""
         check_record(self, half_width=0.0)
 
 

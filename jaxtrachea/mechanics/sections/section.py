@@ -142,7 +142,6 @@ def make_grid(shape: Shape, *, midline: bool) -> Grid:
     """The quadrature of a cross-section.
 
     Args:
-        shape: the cross-section.
         midline: half a ring, for symmetric modes only.
     """
     dtype = shape.radius.dtype
@@ -203,7 +202,6 @@ def close_ring(
     Args:
         turn: rotation of the modes alone, at the points.
         stretch: 1 + eps there.
-        grid: the quadrature.
     """
 
     def step(state):
@@ -283,9 +281,7 @@ def energy(q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape) -> F
 
     Args:
         q: modes, mm; (4,) on the midline, else (8,).
-        ring: stiffness.
         grid: of this shape.
-        shape: the cross-section.
     """
     return line_energy(deform(q, grid, shape), ring, grid, shape)
 
@@ -308,25 +304,8 @@ def muscle(ring: Ring, shape: Shape):
     return 2 * (jnp.pi - shape.half_angle) * ring.pitch * ring.Et_M / shape.radius
 
 
-def surface_motion(
-    q: Float[Array, " modes"], phi: Float[Array, ""], grid: Grid, shape: Shape
-) -> Float[Array, "2"]:
-    """Displacement of the outer surface at an angle on the cartilage, mm.
-
-    Args:
-        q: modes, mm.
-        phi: rad, in [-alpha, alpha].
-        grid: of this shape.
-        shape: the cross-section.
-
-    Returns:
-        Along the inward normal and along the circumference at phi.
-    """
-    return line_motion(deform(q, grid, shape), phi, grid, shape)
-
-
 def line_motion(line: Line, phi: Float[Array, ""], grid: Grid, shape: Shape) -> Float[Array, "2"]:
-    """`surface_motion` of a line that is known."""
+    """Displacement of the outer surface at phi, rad, on the cartilage: inward and round it, mm."""
     y, z = way_to(line, phi, grid, shape).motion
     normal, side = jnp.cos(phi), jnp.sin(phi)
     return jnp.stack([-y * normal - z * side, z * normal - y * side])

@@ -21,7 +21,6 @@ from jaxtrachea.mechanics.sections.section import (
     Shape,
     bed_motion,
     bend,
-    deform,
     mean_weights,
     muscle,
     small_solve,
@@ -126,29 +125,15 @@ def _held(line: Line, loads: _Loads, ring: Ring, grid: Grid, shape: Shape):
     return held, gradient, -small_solve(by_lam, gaps[:, : grid.modes])
 
 
-def ring_forces(
-    q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape
-) -> Float[Array, " modes"]:
-    """dU/dq of `section.energy`, N."""
-    return line_forces(deform(q, grid, shape), ring, grid, shape)
-
-
 def line_forces(line: Line, ring: Ring, grid: Grid, shape: Shape) -> Float[Array, " modes"]:
-    """`ring_forces` of a line that is known."""
+    """dU/dq of `section.energy`, N."""
     return _held(line, _loads(line, ring, grid, shape), ring, grid, shape)[1]
-
-
-def ring_tangent(
-    q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape
-) -> tuple[Float[Array, " modes"], Float[Array, "modes modes"]]:
-    """dU/dq, N, and d2U/dq2, N/mm."""
-    return line_tangent(deform(q, grid, shape), ring, grid, shape)
 
 
 def line_tangent(
     line: Line, ring: Ring, grid: Grid, shape: Shape
 ) -> tuple[Float[Array, " modes"], Float[Array, "modes modes"]]:
-    """`ring_tangent` of a line that is known."""
+    """dU/dq, N, and d2U/dq2, N/mm."""
     loads, gradient, follow = _held(line, _loads(line, ring, grid, shape), ring, grid, shape)
     kappa = line.w @ grid.curve / shape.radius
     EI = jnp.where(grid.behind > 0, ring.EI_M, ring.EI_C)
@@ -196,7 +181,6 @@ def surface_tangent(
         phi: angle of the point on the cartilage, rad.
         force: inward and, unless it has one entry, along the circumference, N.
         grid: of the line.
-        shape: the cross-section.
     """
     way = way_to(line, phi, grid, shape)
     y, z = way.motion

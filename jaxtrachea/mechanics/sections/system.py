@@ -380,13 +380,8 @@ def excess_negative(tangent: Tangent) -> Int[Array, ""]:
     return tangent.factors.negative + tangent.negative
 
 
-def stored_energy(state: State, system: System) -> Float[Array, ""]:
-    """Energy of rings, spans, ends and the contact's own compliances, N mm."""
-    return stored_energy_of(lines(state, system), state, system)
-
-
 def stored_energy_of(line: Line, state: State, system: System) -> Float[Array, ""]:
-    """`stored_energy` where the mid-lines are known."""
+    """Energy of rings, spans, ends and the contact's own compliances, N mm; mid-lines given."""
     rings = jax.vmap(line_energy, (0, 0, None, None))
     in_rings = rings(of_rings(line, system), system.rings, system.grid, system.shape)
     spans = jax.vmap(span_energy)(_pairs(physical(state, system)), system.spans)

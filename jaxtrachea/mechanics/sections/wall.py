@@ -123,7 +123,6 @@ def modes_along(
         nodes: ends of the tube and rings, mm.
         unknowns: q and psi of each node.
         spans: stacked.
-        contact: of the tool.
     """
     acts, load = acting_place(nodes, contact.s, contact.footprint)
     E = jnp.asarray(selector(unknowns.shape[1], unknowns.dtype))

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea.scene.build import Staged
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Presses
+from jaxtrachea.tradeoff.operations import count_operations
 
 
 def shares(staged: Staged) -> tuple[int, dict[str, float]]:
