@@ -106,7 +106,9 @@ NumberOrTrue = Annotated[Any, BeforeValidator(_value_or_true)]
 class Section(BaseModel):
     """A table of a specification: strict, closed, finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, defer_build=True
+    )
 
 
 class DataSection(Section):

@@ -12,6 +12,8 @@ from typing import Any
 
 #: Characters of a name in a picture; beyond it, an ellipsis.
 LONGEST = 48
+#: PNG in half of the time, a twelfth larger.
+QUICKLY = {"compress_level": 1}
 #: What all figures share.
 STYLE: dict[Any, object] = {
     "axes.spines.top": False,
@@ -70,7 +72,7 @@ def save_each(
                 if name.endswith(".svg"):
                     FigureCanvasSVG(draw()).print_svg(memory)
                 else:
-                    FigureCanvasAgg(draw()).print_png(memory)
+                    FigureCanvasAgg(draw()).print_png(memory, pil_kwargs=QUICKLY)
         except Exception as error:  # a picture is worth less than the numbers
             lost[name] = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             continue
