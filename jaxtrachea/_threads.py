@@ -10,6 +10,8 @@ from typing import Any
 def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """`functools.lru_cache` for threads: while one makes a value, the others wait for it.
 
+    What it returns has `cache_clear` too.
+
     Args:
         maxsize: values kept.
     """
@@ -22,6 +24,7 @@ def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]
             with making:
                 return cached(*arguments, **named)
 
+        waiting.cache_clear = cached.cache_clear  # pyright: ignore[reportFunctionMemberAccess]
         return waiting
 
     return decorate

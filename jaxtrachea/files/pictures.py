@@ -60,7 +60,6 @@ def save_each(
         OSError: a file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     paths, lost = [], {}
     for name, draw in drawings.items():
@@ -70,6 +69,8 @@ def save_each(
                 # A letter that the font has not got is drawn as a box.
                 warnings.filterwarnings("ignore", message=r"(?s).*Glyph .* missing")
                 if name.endswith(".svg"):
+                    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
                     FigureCanvasSVG(draw()).print_svg(memory)
                 else:
                     FigureCanvasAgg(draw()).print_png(memory, pil_kwargs=QUICKLY)
