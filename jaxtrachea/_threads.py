@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Any]:
     """`functools.lru_cache` for threads: while one makes a value, the others wait for it.
 
     What it returns has `cache_clear` too.
@@ -16,7 +16,7 @@ def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]
         maxsize: values kept.
     """
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(function: Callable[..., Any]) -> Any:
         cached, making = functools.lru_cache(maxsize)(function), threading.Lock()
 
         @functools.wraps(cached)
@@ -24,7 +24,7 @@ def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]
             with making:
                 return cached(*arguments, **named)
 
-        waiting.cache_clear = cached.cache_clear  # pyright: ignore[reportFunctionMemberAccess]
+        vars(waiting)["cache_clear"] = cached.cache_clear
         return waiting
 
     return decorate

@@ -37,7 +37,7 @@ def program(
 def forget() -> None:
     """Let go of all programs, 10 to 40 MB each, where a folder has them to be loaded again."""
     if traces.are_kept():
-        program.cache_clear()  # pyright: ignore[reportFunctionMemberAccess]
+        program.cache_clear()
 
 
 def cast(tree: Any, dtype) -> Any:

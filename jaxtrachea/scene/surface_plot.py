@@ -308,13 +308,11 @@ def _draw_solids(axis: Any, camera: np.ndarray, wall, tool, share, rings):
         paint[:, :3] *= light[:, None]
         corners.append(solid[front])
         faced.append(paint[front])
-    corners, faced = np.concatenate(corners), np.concatenate(faced)
-    order = np.argsort(corners[:, :, 2].mean(axis=1))
-    corners, faced = corners[order], faced[order]
+    solids: Any = np.concatenate(corners)
+    order = np.argsort(solids[:, :, 2].mean(axis=1))
+    solids, faced = solids[order, :, :2], np.concatenate(faced)[order]
     edges = np.where(faced[:, 3:] == 1, faced, 0)
-    axis.add_collection(
-        PolyCollection(corners[:, :, :2], facecolors=faced, edgecolors=edges, linewidths=0.3)
-    )
+    axis.add_collection(PolyCollection(solids, facecolors=faced, edgecolors=edges, linewidths=0.3))
     turned = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     edge = crossings(wall.faces[turned[:, 2] > 0], rings).at(seen)
     axis.add_collection(_segments(edge[:, :, :2], RING, linewidths=0.7))
