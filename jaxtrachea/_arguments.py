@@ -38,14 +38,14 @@ def real(name: str, value: Any, dtype=None) -> Array:
     try:
         if isinstance(value, str | bytes):
             raise TypeError("text")
-        number = isinstance(value, int) and not isinstance(value, bool)
+        number = type(value) is float or isinstance(value, int) and not isinstance(value, bool)
         if type(value) is np.ndarray:
             # Of a copy, that the caller cannot change; `jnp.asarray` compiles for every shape.
             array = jax.device_put(np.array(value))
         elif isinstance(value, Array):
             array = value
         else:
-            array = jnp.asarray(float(value) if number else value)
+            array = jax.device_put(float(value)) if number else jnp.asarray(value)
     except (TypeError, ValueError, OverflowError):
         array = None
     if array is None or not (
@@ -53,9 +53,19 @@ def real(name: str, value: Any, dtype=None) -> Array:
     ):
         raise ValueError(f"{name} is {_shown(value)}; expected a number or an array of numbers")
     if jnp.issubdtype(array.dtype, jnp.integer):
-        return array.astype(jnp.zeros(0, dtype).dtype)
+        return array.astype(float_dtype(dtype))
     own = isinstance(value, np.ndarray | Array)
     return array if own or dtype is None else array.astype(dtype)
+
+
+def float_dtype(dtype: Any = None) -> Any:
+    """The dtype of JAX's arrays for one that is asked for, None: its own; nothing is compiled."""
+    return jax.eval_shape(functools.partial(jnp.zeros, 0, dtype)).dtype
+
+
+def without_program(value: Any) -> Array:
+    """As `jnp.asarray`, which compiles a program for every shape of numpy's arrays."""
+    return jax.device_put(value) if isinstance(value, np.ndarray) else jnp.asarray(value)
 
 
 def shaped(name: str, value: Any, *shapes: tuple[int | str, ...], dtype=None, why: str = ""):

@@ -7,10 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 
-def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """`functools.lru_cache` for threads: while one makes a value, the others wait for it."""
+def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Any]:
+    """`functools.lru_cache` for threads: while one makes a value, the others wait for it.
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+    What it returns has `cache_clear` too.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
         cached, making = functools.lru_cache(maxsize)(function), threading.Lock()
 
         @functools.wraps(cached)
@@ -18,6 +21,7 @@ def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]
             with making:
                 return cached(*arguments, **named)
 
+        vars(waiting)["cache_clear"] = cached.cache_clear
         return waiting
 
     return decorate

@@ -108,7 +108,9 @@ Texts = Annotated[list[str], BeforeValidator(lambda v: [v] if isinstance(v, str)
 class Section(BaseModel):
     """A table of a specification: strict, closed, finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, defer_build=True
+    )
 
 
 class DataSection(Section):

@@ -115,6 +115,7 @@ def test_scene_runs(scene, monkeypatch, capsys):
         level = {row[0]: row[1] for row in json.loads(file.attrs["plan"])}
         assert SHOWS[scene.stem].items() <= level.items()
         force, status = file["series/force"][:], file["series/status"][:]
+        surface = [file[n][()] for n in ("series/vertices", "rest/faces") if n in file]
         assert file["series/force"].attrs["units"] == "N"
     assert np.isfinite(force).all()
     table = pd.read_csv(result / "forces.csv")
@@ -124,8 +125,11 @@ def test_scene_runs(scene, monkeypatch, capsys):
     assert set(status.flat) <= {0, 1, PressStatus.LIFTED}
     assert np.abs(force[-1]).max() > 0
     if "deformed.ply" in files:
-        ply, glb = (trimesh.load(result / f"deformed.{s}", force="mesh") for s in ("ply", "glb"))
-        np.testing.assert_allclose(ply.extents, 1e3 * glb.extents, rtol=1e-5)
+        vertices, faces = surface
+        for suffix, scale in (("ply", 1), ("glb", 1e3)):
+            mesh = trimesh.load_mesh(result / f"deformed.{suffix}", process=False)
+            np.testing.assert_allclose(scale * mesh.vertices, vertices[-1], rtol=0, atol=2e-5)
+            np.testing.assert_array_equal(mesh.faces, faces)
 
 
 @pytest.mark.slow

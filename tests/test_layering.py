@@ -347,23 +347,10 @@ LOADS = {
     "--version": (["--version"], SHOWS),
     "init": (["init", FIT.with_name("small_strain.h5")], READS),
     "check": (["check", FIT], READS),
-    # The hull of the tool, and how far its patches are from the wall.
-    "plan": (["plan", SCENE], READS | {"scipy", "scipy.spatial", "scipy.special"}),
     # JAX itself takes LAPACK from scipy.
+    "plan": (["plan", SCENE], READS | {"scipy"}),
     "fit": (["fit", FIT], READS | {"scipy", "scipy.special", "matplotlib", "PIL"}),
-    "simulate": (
-        ["simulate", SCENE],
-        READS
-        | {
-            "scipy",
-            "scipy.spatial",
-            "scipy.special",
-            "matplotlib",
-            "PIL",
-            "trimesh",
-            "scipy.optimize",
-        },
-    ),
+    "simulate": (["simulate", SCENE], READS | {"scipy", "matplotlib", "PIL"}),
 }
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rich.markup import escape
 
+from jaxtrachea._memory import give_back
 from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
 
 #: Arrays that a curve and its lane have in common.
@@ -43,7 +44,9 @@ def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[st
         _note_unused_batch(spec, study, printed)
         measurements = _with_zeros(measurements, study, printed)
         measurements, study = _samples_once(measurements, study)
-        return spec, _with_depths(measurements, study, printed), study
+        measurements = _with_depths(measurements, study, printed)
+        give_back()
+        return spec, measurements, study
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
     except DataError as error:

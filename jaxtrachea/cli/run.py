@@ -18,6 +18,9 @@ from jaxtrachea.cli.terminal import (
     to_stderr,
 )
 
+#: Fits of a study whose programs, some 200 MB, are let go before its results take their room.
+LARGE = 1000
+
 
 def refuse(path: Path, request) -> None:
     """End the command where something asked for cannot be done; say what it leaves out."""
@@ -38,6 +41,7 @@ def run(request, stop_if_asked, fit=None):
     from jaxtrachea.fitting.fit import fit as in_one_go
     from jaxtrachea.fitting.fit import with_omitted_zeros
     from jaxtrachea.inference.analyses import analyse
+    from jaxtrachea.optimisation.programs import forget
 
     with progress_bar() as bar:
         stages = Stages(bar, stop_if_asked)
@@ -47,8 +51,11 @@ def run(request, stop_if_asked, fit=None):
         if fit is None:
             result = in_one_go(*asked, progress)
         else:  # shards are of some lanes each: the whole study takes more zeros
-            result = fit(*asked, progress)
-            result = with_omitted_zeros(asked[0], result, asked[1], progress)
+            # By no name of its own: it is as large as the one that takes its place.
+            result = with_omitted_zeros(asked[0], fit(*asked, progress), asked[1], progress)
+            if result.lanes > LARGE:
+                forget()
+                give_back()
         findings = analyse(request, result, stages.begin)
         stages.close()
         give_back()
@@ -63,7 +70,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.files.html import page
     from jaxtrachea.files.pictures import with_ending, without_lost
     from jaxtrachea.files.provenance import provenance, write_provenance
-    from jaxtrachea.files.table import Table
+    from jaxtrachea.files.table import write_csv
     from jaxtrachea.measurements.usage_tables import usage_section
     from jaxtrachea.report.fit import report_text
     from jaxtrachea.report.plots import draw_all
@@ -75,10 +82,10 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
 
     ending = loaded.output.format
     with beside(draw_all, folder, findings, ending) as drawing:
-        Table(summary_rows(findings, measurements.bad)).write_csv(folder / "summary.csv")
-        Table(parameter_rows(findings)).write_csv(folder / "parameters.csv")
+        write_csv(folder / "summary.csv", summary_rows(findings, measurements.bad))
+        write_csv(folder / "parameters.csv", parameter_rows(findings))
         apart = differing_trials(measurements.curves)
-        Table(_curve_rows(measurements, findings, apart)).write_csv(folder / "curves.csv")
+        write_csv(folder / "curves.csv", _curve_rows(measurements, findings, apart))
         write_tables(folder, findings)
         title = loaded.title or spec.stem
         curves = measurements.curves

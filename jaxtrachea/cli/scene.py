@@ -72,7 +72,6 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     from jaxtrachea.scene.results import (
         last_solved,
         write_forces,
-        write_meshes,
         write_simulation,
     )
     from jaxtrachea.scene.simulation import simulate as run
@@ -89,8 +88,6 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     staged, choice = _chosen(scene, spec, staged)
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
-        if spec.output.surface:
-            load_beside("trimesh")
         if spec.output.pictures:
             load_beside("jaxtrachea.scene.surface_plot")
         with progress_bar(transient=True) as bar:
@@ -102,7 +99,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
             stages.begin("drawing and writing")
             title = spec.title or scene.stem
             with beside(_draw, folder, title, spec.output.pictures, staged, out) as drawing:
-                write_meshes(folder, staged.scene, out)
+                _write_surface(folder, staged.scene, out)
                 write_forces(folder / "forces.csv", out, staged.scene.names)
                 made = _provenance(scene, staged, clock)
                 motion = staged.material, staged.path
@@ -318,6 +315,18 @@ def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, st
     if out.vertices is not None and row is not None:
         drawings["surface.png"] = partial(draw_surface, *shown, row, title)
     return save_each(folder, drawings)[1]
+
+
+def _write_surface(folder: Path, scene, out) -> None:
+    """The surface of the last solved row as meshes."""
+    import numpy as np
+
+    from jaxtrachea.scene.gltf import write_meshes
+    from jaxtrachea.scene.results import last_solved
+
+    row = last_solved(out)
+    if out.vertices is not None and scene.mesh is not None and row is not None:
+        write_meshes(folder, np.asarray(scene.mesh.faces), np.asarray(out.vertices[row], float))
 
 
 def _write_recording(folder: Path, output) -> None:

@@ -31,6 +31,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._arguments import float_dtype
 from jaxtrachea._numerics import first_largest, largest, lowest, total
 from jaxtrachea.contact.distance import approach, signed_distance
 from jaxtrachea.contact.line import Centreline, skeleton_coordinates
@@ -122,7 +123,7 @@ def straight_patches(borders: ArrayLike, radius: ArrayLike, *, overlap=0.5, dtyp
         ValueError: naming the argument.
     """
     at = check_borders(borders)
-    dtype = jnp.zeros(0, dtype).dtype
+    dtype = float_dtype(dtype)
     r = jnp.asarray(radius, dtype)
     if r.ndim != 0 or not isinstance(r, Tracer) and not float(r) > 0:
         raise ValueError(f"radius: expected a positive number, found {radius}")

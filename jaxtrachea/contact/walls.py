@@ -13,9 +13,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._arguments import float_dtype
 from jaxtrachea.contact.line import Centreline
 from jaxtrachea.contact.patches import Patches, check_borders
 from jaxtrachea.contact.search import coarse_directions
@@ -98,7 +98,7 @@ def patches_of(
     cores = np.stack([_filled_up(p[0], count) for p in hulls])
 
     def cast(x):
-        return jax.device_put(np.asarray(x, jnp.zeros(0, dtype).dtype))  # nothing is compiled
+        return jax.device_put(np.asarray(x, float_dtype(dtype)))  # nothing is compiled
 
     shapes = Shape(cast(cores), cast([p[1] for p in hulls]))
     middles, lost, filled = (cast([p[i] for p in hulls]) for i in (2, 3, 4))

@@ -12,6 +12,8 @@ from typing import Any
 
 #: Characters of a name in a picture; beyond it, an ellipsis.
 LONGEST = 48
+#: PNG in half of the time, a twelfth larger.
+QUICKLY = {"compress_level": 1}
 #: What all figures share.
 STYLE: dict[Any, object] = {
     "axes.spines.top": False,
@@ -52,7 +54,6 @@ def save_each(
         OSError: a file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     paths, lost = [], {}
     for name, draw in drawings.items():
@@ -62,9 +63,11 @@ def save_each(
                 # A letter that the font has not got is drawn as a box.
                 warnings.filterwarnings("ignore", message=r"(?s).*Glyph .* missing")
                 if name.endswith(".svg"):
+                    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
                     FigureCanvasSVG(draw()).print_svg(memory)
                 else:
-                    FigureCanvasAgg(draw()).print_png(memory)
+                    FigureCanvasAgg(draw()).print_png(memory, pil_kwargs=QUICKLY)
         except Exception as error:  # a picture is worth less than the numbers
             lost[name] = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             continue

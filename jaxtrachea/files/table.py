@@ -12,6 +12,7 @@ OWASP recommends ("CSV injection", https://owasp.org/www-community/attacks/CSV_I
 import csv
 import dataclasses
 import html
+import io
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -208,12 +209,8 @@ class Table(Sequence):
         return [self.markdown(), *([f"{self.more}."] if self.more else [])]
 
     def write_csv(self, path: Path) -> None:
-        """Write all cells; what is not there is empty, NaN of a number `nan`, formulas quoted."""
-        names = self.names
-        with path.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream)
-            writer.writerow([quoted(name) for name in names])
-            writer.writerows([[quoted(row.get(name)) for name in names] for row in self.rows])
+        """As `write_csv`."""
+        write_csv(path, self.rows)
 
     def write_hdf5(self, group: Any) -> None:
         """Write each cell as a dataset of an h5py group; words as text, None of a number as NaN."""
@@ -226,6 +223,32 @@ class Table(Sequence):
                 group.create_dataset(name, data=words, dtype=h5py.string_dtype())
             else:
                 group[name] = [math.nan if cell is None else cell for cell in cells]
+
+
+def write_csv(path: Path, rows: Iterable[Row]) -> None:
+    """Write all cells; what is not there is empty, NaN of a number `nan`, formulas quoted.
+
+    A row is kept as its line: names that come later stand behind those that are known.
+
+    Args:
+        path: of the file.
+        rows: asked for one after the other.
+    """
+    names: dict[str, None] = {}
+    lines: list[tuple[int, str]] = []
+    for row in rows:
+        names |= dict.fromkeys(row)
+        lines.append((len(names), _line(quoted(row.get(name)) for name in names)))
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        stream.write(_line(map(quoted, names)) + "\r\n")
+        stream.writelines(f"{line}{',' * (len(names) - known)}\r\n" for known, line in lines)
+
+
+def _line(cells: Iterable[object]) -> str:
+    """A line of a CSV file, without its end."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerow(cells)
+    return text.getvalue().removesuffix("\r\n")
 
 
 def ends(low: str, high: str) -> Callable[[Row], object]:

@@ -62,6 +62,11 @@ def keep_traces(folder: Path | None) -> None:
     _folder = None if remote else folder
 
 
+def are_kept() -> bool:
+    """Whether this process keeps traces."""
+    return _folder is not None
+
+
 def optimise_afterwards() -> None:
     """Have what this process found unoptimised be optimised for later starts; nobody waits."""
     if _found_unoptimised:

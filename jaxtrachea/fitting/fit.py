@@ -114,6 +114,8 @@ def with_omitted_zeros(
         near = near_estimates(result, study, asked)
         _log.info("%d curves ask for an onset or an offset; fitted again", len(asked.names))
         rows = np.flatnonzero([any(_key(c) in asked.names for c in lane) for lane in study.curves])
+        # As large as the data; who asks for them again has them computed again.
+        vars(result).pop("residuals", None)
         new = _without_more_zeros(study.take(rows), settings, alive, None, near[rows])
         result = merged(study, result, rows, new)
     return result

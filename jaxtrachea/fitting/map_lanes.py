@@ -43,17 +43,21 @@ def map_lanes(
     count = len(arrays[0])
     rows = np.arange(count) if rows is None else rows
     unoptimised = study.evaluates_few(count) if unoptimised is None else unoptimised
-    run, parts = program(function, study.model, *static, unoptimised=unoptimised), []
+    run, out = program(function, study.model, *static, unoptimised=unoptimised), None
     for first in range(0, count, batch):
         here = np.minimum(np.arange(first, first + batch), count - 1)
         lane = jax.tree.map(lambda v, at=rows[here]: v[at], study.lanes)
         before, *after = cast([v[here] for v in arrays], dtype)
         part = run(before, cast(lane, dtype), *after)
         left = min(count - first, batch)
-        parts.append(jax.tree.map(lambda v, left=left: _on_host(v)[:left], part))
+        part = jax.tree.map(_on_host, part)
+        if out is None:  # all batches in their places: beside one another they were there twice
+            out = jax.tree.map(lambda v: np.empty((count, *v.shape[1:]), v.dtype), part)
+        for whole, some in zip(jax.tree.leaves(out), jax.tree.leaves(part), strict=True):
+            whole[first : first + left] = some[:left]
         if progress is not None:
             progress(left)
-    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+    return out
 
 
 def _on_host(value) -> np.ndarray:

@@ -32,6 +32,8 @@ def predictions(
     for kind in forces(lanes) + markers(lanes):
         after = first + lanes.force.shape[-1] * kind.places
         part, first = value[..., first:after].reshape(kind.data.shape), after
-        residual = np.full(part.shape, np.nan)
-        found[kind.name] = np.divide(part, kind.precision, out=residual, where=kind.precision > 0)
+        weighed = kind.precision > 0
+        np.divide(part, kind.precision, out=part, where=weighed)
+        np.copyto(part, np.nan, where=~weighed)
+        found[kind.name] = part
     return found

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from jaxtrachea._threads import made_once
+from jaxtrachea.files import traces
 from jaxtrachea.files.traces import Traced
 
 
@@ -31,6 +32,12 @@ def program(
         unoptimised: compiled without optimisation, in a third of the time: for little work.
     """
     return Traced(function, *static, axes=axes, donate=donate, unoptimised=unoptimised)
+
+
+def forget() -> None:
+    """Let go of all programs, 10 to 40 MB each, where a folder has them to be loaded again."""
+    if traces.are_kept():
+        program.cache_clear()
 
 
 def cast(tree: Any, dtype) -> Any:

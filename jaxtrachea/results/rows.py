@@ -1,6 +1,6 @@
 """Rows of summary.csv and parameters.csv (docs/results.md)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -83,14 +83,15 @@ def _unknown_cells(
 
 def summary_rows(
     findings: AnalysisResults, bad: Sequence[BadCurve] = ()
-) -> list[dict[str, object]]:
+) -> Iterator[dict[str, object]]:
     """All rows of summary.csv: those of the lanes, then curves that could not be used."""
-    rows = list(lane_rows(findings.result, findings.profiles))
+    rows = lane_rows(findings.result, findings.profiles)
     rows = with_residuals(findings.result, rows, findings.result.residuals)
     for (lane, _), row in zip(row_places(findings.result), rows, strict=True):
         for analysis, found in findings.found:
             row.update(analysis.lane_cells(found, lane))
-    return [*rows, *map(bad_row, bad)]
+        yield row
+    yield from map(bad_row, bad)
 
 
 def bad_row(bad: BadCurve) -> dict[str, object]:
@@ -117,10 +118,9 @@ def parameter_rows(findings: AnalysisResults) -> Iterator[dict[str, object]]:
 
 
 def with_residuals(
-    result: FitResult, rows: list[dict[str, object]], seen: Prediction
-) -> list[dict[str, object]]:
+    result: FitResult, rows: Iterable[dict[str, object]], seen: Prediction
+) -> Iterator[dict[str, object]]:
     """Rows of `lane_rows`; that of one specimen among several of a lane has its own residuals."""
-    out = []
     for (lane, specimen), row in zip(row_places(result), rows, strict=True):
         cells: dict[str, object] = {}
         if specimen:
@@ -131,5 +131,4 @@ def with_residuals(
             cells = {"rms_force_N": own, "rms_over_peak": own / peak if peak > 0 else np.nan}
             if "joints" in seen:
                 cells["rms_joints_mm"] = float(rms(seen["joints"][lane, trials].ravel()))
-        out.append(row | cells)
-    return out
+        yield row | cells

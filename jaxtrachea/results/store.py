@@ -6,7 +6,8 @@ Numbers and JSON (as bytes) only; `read` makes the study of them again.
 import dataclasses
 import json
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import h5py
@@ -81,15 +82,21 @@ def _write_lanes(group: h5py.Group, study: Study) -> None:
     }
     if study.shares is not None:
         arrays |= {f"shares_{name}": v for name, v in study.shares._asdict().items()}
+    rows = placed(study)
     for name, values in arrays.items():
         if values is None or name in ("displacement", "force", "others"):
             continue
         values = np.asarray(values)
-        if name in BY_SAMPLE:
-            values = np.concatenate(
-                [values[k, t, : len(c.force)] for k, t, c in placed(study)]
-            )  # fmt: skip
-        group.create_dataset(name, data=values, **_packing(values))
+        _put(group, name, _end_to_end(values, rows) if name in BY_SAMPLE else values)
+
+
+def _end_to_end(values: np.ndarray, rows: list[tuple[int, int, Curve]]) -> np.ndarray:
+    """Samples of the curves, without those that fill up shorter ones."""
+    return np.concatenate([values[k, t, : len(c.force)] for k, t, c in rows])
+
+
+def _put(group: h5py.Group, name: str, values: np.ndarray) -> None:
+    group.create_dataset(name, data=values, **_packing(values))
 
 
 def placed(study: Study) -> list[tuple[int, int, Curve]]:
@@ -121,38 +128,47 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
     group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in rows])
     if study.model.relaxes:
         group["rise"] = np.array([c.rise or (0, len(c.force)) for c in curves], np.int64)
-    for name, values in _columns(result, rows):
-        group.create_dataset(name, data=values, **_packing(values))
+    for name, column in _columns(result, rows).items():
+        _put(group, name, column())
 
 
 def _columns(
     result: FitResult, rows: list[tuple[int, int, Curve]]
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Columns of samples end to end, one after the other: all at once take as much as the study."""
+) -> dict[str, Callable[[], np.ndarray]]:
+    """What makes each column of samples end to end: two at once take as much as the study."""
     study, seen = result.study, result.residuals
-    curves = [c for _, _, c in rows]
-
-    def of(values: np.ndarray) -> np.ndarray:
-        return np.concatenate([values[k, t, : len(c.force)] for k, t, c in rows])
-
-    force, residual = np.concatenate([c.force for c in curves]), of(seen["force"])
-    yield "displacement", np.concatenate([c.displacement for c in curves])
-    yield "force", force
+    rings, curves = study.model.geometry.rings, [c for _, _, c in rows]
     unknown = np.full(max(len(c.force) for c in curves), np.nan)
-    sigma = [unknown[: len(c.force)] if c.sigma is None else c.sigma for c in curves]
-    yield "sigma", np.concatenate(sigma)
-    yield "residual", residual
-    yield "predicted", force + residual
-    for kind in (forces(study.lanes) + markers(study.lanes))[1:]:
-        rings, head = study.model.geometry.rings, HEADS[kind.name]
-        given = np.concatenate([measured(c, kind.name, rings) for c in curves])
-        yield kind.name, given
-        residual = of(seen[kind.name])
-        yield f"{head}residual", residual
-        if kind.name in FITTED_NUMBERS:
-            yield f"{head}predicted", given + residual
+
+    def of(curve: Curve, name: str) -> np.ndarray:
+        own = name in ("displacement", "force")
+        return getattr(curve, name) if own else measured(curve, name, rings)
+
+    def given(name: str) -> np.ndarray:
+        return np.concatenate([of(c, name) for c in curves])
+
+    def predicted(name: str) -> np.ndarray:
+        values, end = np.asarray(_end_to_end(seen[name], rows), np.float64), 0
+        for curve in curves:
+            start, end = end, end + len(curve.force)
+            values[start:end] += of(curve, name)
+        return values
+
+    def sigma() -> np.ndarray:
+        known = (unknown[: len(c.force)] if c.sigma is None else c.sigma for c in curves)
+        return np.concatenate([*known])
+
+    columns: dict[str, Callable[[], np.ndarray]]
+    columns = {"displacement": partial(given, "displacement"), "sigma": sigma}
+    for kind in forces(study.lanes) + markers(study.lanes):
+        name, head = kind.name, HEADS[kind.name]
+        columns[name] = partial(given, name)
+        columns[f"{head}residual"] = partial(_end_to_end, seen[name], rows)
+        if name == "force" or name in FITTED_NUMBERS:
+            columns[f"{head}predicted"] = partial(predicted, name)
     if study.model.relaxes:
-        yield "time", np.concatenate([c.time for c in curves if c.time is not None])
+        columns["time"] = lambda: np.concatenate([c.time for c in curves if c.time is not None])
+    return columns
 
 
 def _packing(values: np.ndarray) -> dict[str, Any]:

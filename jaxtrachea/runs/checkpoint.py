@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analyses import widened
+from jaxtrachea.optimisation.programs import forget
 from jaxtrachea.results.read import read_again
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
@@ -23,6 +25,9 @@ from jaxtrachea.runs.shards import divide, join, load, replaced, save
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
+#: Shards after which their programs are let go: those of few lanes come to 200 MB, and what all
+#: lanes want is loaded again in a second.
+SHARDS = 3
 #: Seconds between two looks at the threads.
 LOOK = 0.02
 
@@ -71,7 +76,7 @@ def fit_shards(
     from jaxtrachea.fitting.fit import fit
 
     part = fitted_lanes(run, study)
-    shards = shards_of(run, part)
+    shards, saved = shards_of(run, part), itertools.count(1)
     jobs, telling = settings.starts * sum(len(shards[k]) for k in todo), threading.Lock()
 
     def one(k: int, end: _End) -> None:
@@ -83,9 +88,14 @@ def fit_shards(
 
         result = fit(part.take(shards[k]), settings, tell)
         save(run.shard(k), run.manifest, shards[k], result)
+        if next(saved) % SHARDS == 0:
+            forget()
         give_back()
 
     _in_threads(one, todo, devices)
+    if len(todo) > 1:
+        forget()
+        give_back()
 
 
 class _Ended(Exception):

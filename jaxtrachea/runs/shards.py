@@ -106,13 +106,17 @@ def free_memory(workers: int) -> float:
 
 def join(study: Study, parts: Iterable[FitResult]) -> FitResult:
     """One result out of those of consecutive lanes; `study` holds all of them."""
-    each, weighed = [], False
-    for part in parts:
+    arrays: dict[str, np.ndarray] = {}
+    weighed, end = False, 0
+    for part in parts:  # one after the other: together they are as large as the study
         weighed |= part.study.shares is not None
-        each.append(arrays_of(part, weighed=True))
-    names = [n for n in each[0] if weighed or not n.startswith("shares.")]
-    # Those of the parts go as they are joined: together they are as large as the study.
-    return result_of(study, {n: np.concatenate([a.pop(n) for a in each]) for n in names})
+        start, end = end, end + part.lanes
+        for name, values in arrays_of(part, weighed=True).items():
+            if name not in arrays:
+                arrays[name] = np.empty((len(study.curves), *values.shape[1:]), values.dtype)
+            arrays[name][start:end] = values
+    names = [n for n in arrays if weighed or not n.startswith("shares.")]
+    return result_of(study, {n: arrays[n] for n in names})
 
 
 def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:

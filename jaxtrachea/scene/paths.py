@@ -54,11 +54,11 @@ def _path(
     geometry: Geometry,
 ) -> Poses | Presses:  # fmt: skip
     """The path of one tool; its legs by their place in the file."""
-    from scipy.spatial.transform import Rotation
-
     if spec.path[0].kind == "press":
         reach = 0.0 if spec.effects.width == "point" else spec.model.half_width
         return _presses(legs, geometry, reach)
+    from scipy.spatial.transform import Rotation  # presses do without it
+
     *found, own = zip(*(_leg(leg, i, folder, files) for i, leg in legs.items()), strict=True)
     translation, vectors = (np.concatenate(v) for v in found)
     time = _times(legs, [len(v) for v in found[0]], own)

@@ -1,4 +1,4 @@
-"""Files of a simulation: HDF5 with units, deformed meshes as PLY and GLB."""
+"""Files of a simulation: HDF5 with units, a table of forces."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -179,20 +179,6 @@ def _head(file: h5py.File, provenance: dict, plan: Plan) -> None:
     file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
     file.attrs["provenance"] = json.dumps(provenance)
     file.attrs["plan"] = json.dumps(plan_rows(plan, {}))
-
-
-def write_meshes(folder: Path, scene: Scene, out: Simulation) -> None:
-    """The last solved row's surface as deformed.ply (mm) and deformed.glb (m, as GLB wants)."""
-    import trimesh  # slow to load, only for files
-
-    if out.vertices is None or scene.mesh is None:
-        return
-    row = last_solved(out)
-    if row is None:
-        return
-    vertices, faces = np.asarray(out.vertices[row], float), np.asarray(scene.mesh.faces)
-    for name, scale in (("deformed.ply", 1.0), ("deformed.glb", 1e-3)):
-        trimesh.Trimesh(vertices * scale, faces, process=False).export(folder / name)
 
 
 def last_solved(out: Simulation) -> int | None:

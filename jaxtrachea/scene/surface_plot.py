@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import PathCollection, PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.path import Path
 
 from jaxtrachea.files.pictures import plain
 from jaxtrachea.scene.instruments import scene_of
@@ -277,7 +278,7 @@ def _draw_view(axis: Any, wall, rest, tool, contacts, share, rings, outline) -> 
     _draw_rest(axis, rest @ camera.T, wall.faces, share)
     if outline is not None:
         print_ = outline @ camera.T
-        axis.add_collection(LineCollection(list(print_[:, :, :2]), colors="k", linewidths=1.1))
+        axis.add_collection(_segments(print_[:, :, :2], "k", linewidths=1.1))
     tips = np.stack([camera @ own.tip for own in contacts])[:, 0]
     sides = [1 if tip >= tips.mean() else -1 for tip in tips] if len(tips) > 1 else [None]
     ends = np.concatenate(
@@ -304,15 +305,13 @@ def _draw_solids(axis: Any, camera: np.ndarray, wall, tool, share, rings):
         paint[:, :3] *= light[:, None]
         corners.append(solid[front])
         faced.append(paint[front])
-    corners, faced = np.concatenate(corners), np.concatenate(faced)
-    order = np.argsort(corners[:, :, 2].mean(axis=1))
-    corners, faced = corners[order], faced[order]
+    solids: Any = np.concatenate(corners)
+    order = np.argsort(solids[:, :, 2].mean(axis=1))
+    solids, faced = solids[order, :, :2], np.concatenate(faced)[order]
     edges = np.where(faced[:, 3:] == 1, faced, 0)
-    axis.add_collection(
-        PolyCollection(list(corners[:, :, :2]), facecolors=faced, edgecolors=edges, linewidths=0.3)
-    )
+    axis.add_collection(PolyCollection(solids, facecolors=faced, edgecolors=edges, linewidths=0.3))
     edge = crossings(wall.faces[_turned(triangles)[:, 2] > 0], rings).at(seen)
-    axis.add_collection(LineCollection(list(edge[:, :, :2]), colors=RING, linewidths=0.7))
+    axis.add_collection(_segments(edge[:, :, :2], RING, linewidths=0.7))
     points = triangles.reshape(-1, 3)[:, :2]
     if tool is not None:
         points = np.concatenate([points, (tool.vertices @ camera.T)[:, :2]])
@@ -327,14 +326,18 @@ def _frame_view(axis: Any, camera: np.ndarray, frame: np.ndarray, low, high) -> 
     _draw_scale(axis, camera, frame, low, high)
 
 
+def _segments(ends: np.ndarray, colour: str, zorder: float = 2, **style: Any) -> PathCollection:
+    """Segments of shape (segments, 2, 2) as one path: thousands of paths take a while."""
+    path = Path(ends.reshape(-1, 2), np.tile([Path.MOVETO, Path.LINETO], len(ends)))
+    return PathCollection([path], facecolors="none", edgecolors=colour, zorder=zorder, **style)
+
+
 def _draw_rest(axis: Any, seen: np.ndarray, faces: np.ndarray, share: np.ndarray) -> None:
     """Edges of the surface at rest where it has moved most."""
     faces = faces[(share[faces] > 0.12).all(axis=1)]
     front = _turned(seen[faces])[:, 2] > 0
     edges = np.unique(np.sort(faces[front][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    axis.add_collection(
-        LineCollection(list(seen[edges][:, :, :2]), colors=REST, linewidths=0.35, alpha=0.45)
-    )
+    axis.add_collection(_segments(seen[edges][:, :, :2], REST, linewidths=0.35, alpha=0.45))
 
 
 def _draw_force(axis: Any, camera: np.ndarray, contact: Contact, side: int | None) -> np.ndarray:
@@ -420,7 +423,7 @@ def _draw_length(axis: Any, wall: Triangles, rest, tool, contacts, along, rings)
     point = contact.centre - contact.s * axes[:, 0]
     found, ends = _lines(axis, wall, rest, tool, point, contact.axes[:, 2], axes)
     on = found.at(rings).mean(axis=1) > 0
-    axis.add_collection(LineCollection(list(ends[on]), colors=RING, linewidths=3.2, zorder=2.5))
+    axis.add_collection(_segments(ends[on], RING, linewidths=3.2, zorder=2.5))
     for own in contacts:
         _flat_force(axis, (own.tip - point) @ axes, own.force @ axes, own)
     axis.set(aspect="equal", xlabel="s [mm], carina to larynx", ylabel="to the contact [mm]")
@@ -440,12 +443,12 @@ def _frame(axis: Any) -> None:
 def _lines(axis: Any, wall: Triangles, rest, tool, point, normal, axes):
     """Wall, wall at rest and tool, cut by a plane; the wall's crossings and their ends."""
     _, still = _section(Triangles(rest, wall.faces), point, normal, axes)
-    axis.add_collection(LineCollection(list(still), colors=REST, linewidths=0.9, linestyles="--"))
+    axis.add_collection(_segments(still, REST, linewidths=0.9, linestyles="--"))
     found, ends = _section(wall, point, normal, axes)
-    axis.add_collection(LineCollection(list(ends), colors="k", linewidths=1.3, zorder=2))
+    axis.add_collection(_segments(ends, "k", linewidths=1.3))
     if tool is not None:
         _, cut = _section(tool, point, normal, axes)
-        axis.add_collection(LineCollection(list(cut), colors=TOOL, linewidths=1.4, zorder=3))
+        axis.add_collection(_segments(cut, TOOL, linewidths=1.4, zorder=3))
     return found, ends
 
 

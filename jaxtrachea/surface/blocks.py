@@ -13,6 +13,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Shaped
 
+from jaxtrachea._arguments import without_program
+
 #: Most vertices in a block.
 WIDEST = 32
 #: Least blocks to a patch, on average; filled up are at most a quarter of the number of vertices.
@@ -83,7 +85,7 @@ def in_blocks(
     filled = vertices + to(count * width).reshape(count, width)
     real = ranks < bounds[owner + 1][:, None]
     vertex = xp.where(real, order[xp.minimum(ranks, vertices - 1)], filled)
-    return Blocks(*(jnp.asarray(v, jnp.int32) for v in (vertex, place, order, rank)))
+    return Blocks(*(without_program(xp.asarray(v, np.int32)) for v in (vertex, place, order, rank)))
 
 
 def to_blocks(

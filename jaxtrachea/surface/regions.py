@@ -29,7 +29,7 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._arguments import check_word
+from jaxtrachea._arguments import check_word, without_program
 from jaxtrachea._linear import linear, replaced
 from jaxtrachea._numerics import added, epsilon, total
 from jaxtrachea.surface import phong
@@ -155,14 +155,14 @@ def bind(mesh: Mesh, geometry: Geometry, known: Binding | None = None) -> Bindin
     nodes = xp.concatenate([xp.zeros_like(inner[:1]), inner, length[None]])
     patch = xp.searchsorted(inner, s, side="right").astype(np.int32)
     before = None if known is None else known.blocks
-    blocks = in_blocks(mesh.s, jnp.asarray(patch), nodes.shape[0] - 1, before)
+    blocks = in_blocks(mesh.s, without_program(patch), nodes.shape[0] - 1, before)
     xp = _library((given, blocks))  # within a traced function blocks are traced in any case
     s, phi, patch = (to_blocks(xp.asarray(v), blocks) for v in (s, phi, patch))
     nodes, patch = xp.asarray(nodes), patch[:, 0]
     low, high = (nodes[v][:, None] for v in (patch, patch + 1))
     fraction = xp.clip((s - low) / (high - low), 0, 1)
     s = xp.clip(s, nodes[0], nodes[-1])
-    s, phi, fraction, patch, nodes = (jnp.asarray(v) for v in (s, phi, fraction, patch, nodes))
+    s, phi, fraction, patch, nodes = (without_program(v) for v in (s, phi, fraction, patch, nodes))
     return Binding(s, phi, fraction, patch, nodes, geometry.half_angle, blocks)
 
 

@@ -5,11 +5,10 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxtrachea._arguments import real
+from jaxtrachea._arguments import float_dtype, real
 from jaxtrachea._errors import InputError
 
 
@@ -88,7 +87,7 @@ class Geometry(eqx.Module):
         if not math.pi / 2 < half_angle < math.pi:
             found = f"is {half_angle:.6g} rad"
             raise _refused("half_angle", found, "between pi/2 and pi, 90 and 180 deg")
-        dtype = jnp.zeros(0, dtype).dtype
+        dtype = float_dtype(dtype)
         arrays = (np.asarray(v, dtype) for v in (length, x, radius, half_angle, ring_height))
         return cls(*arrays)
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._arguments import float_dtype
 from jaxtrachea._errors import InputError
 from jaxtrachea.trachea.centreline import (
     Line,
@@ -174,7 +174,7 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     frames = rotation @ where.frames
     normals = vertex_normals(vertices, wall.faces)
     notes += [*cleaned, *found.notes]
-    dtype = jnp.zeros(0, dtype).dtype
+    dtype = float_dtype(dtype)
     fields = (normals, where.s, where.phi, where.distance, frames)
 
     def cast(v):
