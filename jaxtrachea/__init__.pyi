@@ -51,7 +51,7 @@ from .scene.assemble import with_geometry as with_geometry
 from .scene.declare import PlanError as PlanError
 from .scene.effects import EffectOptions as EffectOptions
 from .scene.plan import Plan as Plan
-from .scene.read import read_simulation as read_simulation
+from .output.read import read_simulation as read_simulation
 from .scene.session import Session as Session
 from .scene.simulation import Simulation as Simulation
 from .scene.simulation import simulate as simulate

@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from jaxtrachea.files.pictures import STYLE
 from jaxtrachea.files.table import words
 from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.output.plots import draw_tools
+from jaxtrachea.output.results import plan_rows
+from jaxtrachea.output.surface_plot import draw_rest
 from jaxtrachea.report.fit_pictures import draw_force
 from jaxtrachea.report.shown import Shown
-from jaxtrachea.scene.plots import draw_tools
-from jaxtrachea.scene.results import plan_rows
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Scene
-from jaxtrachea.scene.surface_plot import draw_rest
 
 
 def load_ipython_extension(ipython: Any) -> None:

@@ -19,7 +19,7 @@ from jaxtrachea.contact.shapes import (
     parts_of,
     sphere,
 )
-from jaxtrachea.scene.solids import tool_distance, tool_triangles
+from jaxtrachea.output.solids import tool_distance, tool_triangles
 from jaxtrachea.status import ContactStatus
 from jaxtrachea.trachea.mesh import volume
 from jaxtrachea.viewer.protocol import foremost

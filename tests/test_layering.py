@@ -28,7 +28,7 @@ ORDER = [
     {"trials"},
     {"fitting", "scene", "selfcheck"},
     {"inference"},
-    {"results"},
+    {"results", "output"},
     {"prediction", "runs"},
     {"report"},
     {"tradeoff", "viewer", "notebook"},
@@ -36,7 +36,8 @@ ORDER = [
     {"__main__"},
 ]
 #: Neighbours that stand on different levels.
-STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}),
+STRANGERS = [("output", {"fitting", "inference"}),
+             ("scene", {"fitting", "inference", "results", "prediction", "runs"}),
              ("inference", {"scene"}), ("results", {"scene"}), ("prediction", {"scene", "runs"}),
              ("runs", {"scene"}),
              ("viewer", {"mechanics", "fitting", "inference", "results"}),
@@ -67,8 +68,11 @@ WITHIN = {
         {"step_together"},
         {"step"},
         {"session"},
-        {"build", "results"},
-        {"plots", "read", "solids"},
+        {"build"},
+    ],
+    "output": [
+        {"results", "solids"},
+        {"plots", "read"},
         {"surface_plot", "recording"},
         {"gltf", "vtk_files"},
     ],
@@ -305,7 +309,7 @@ def test_the_walk_sees_a_fault_within_the_scene():
     assert faults("plan", source, order=WITHIN["scene"], within="jaxtrachea.scene") == [
         "simulation"
     ]
-    assert not faults("plots", source, order=WITHIN["scene"], within="jaxtrachea.scene")
+    assert not faults("session", source, order=WITHIN["scene"], within="jaxtrachea.scene")
 
 
 def test_import_is_light():

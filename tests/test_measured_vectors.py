@@ -478,15 +478,15 @@ def test_commands_say_once_what_is_not_read(spec, tmp_path, monkeypatch, capsys)
 
 def test_table_of_curves_shows_vectors(virtual):
     shown = _curve_table([virtual[70, 0], virtual[70, 30], full()])
-    row = dict(zip(shown.head, shown.rows[1], strict=True))
+    row = dict(zip(shown.head, shown.cells[1], strict=True))
     assert row["phi [deg]"] == "30"
     ends = "motion of ring ends U, motion of ring ends V"
     assert row["vectors"] == f"side force, sideward motion of markers, {ends}"
-    assert shown.rows[2][-1].endswith(f"{ends}, tool 53.1° off the normal")
+    assert shown.cells[2][-1].endswith(f"{ends}, tool 53.1° off the normal")
     # A column that is empty for this curve tells nothing of it.
     curve = virtual[70, 30]
     nothing = {name: np.full_like(getattr(curve, name), np.nan) for name in ("side_force", "end_U")}
     shown = _curve_table([dataclasses.replace(curve, **nothing)])
-    assert shown.rows[0][-1] == "sideward motion of markers, motion of ring ends V"
+    assert shown.cells[0][-1] == "sideward motion of markers, motion of ring ends V"
     plain = dataclasses.replace(virtual[70, 0], **dict.fromkeys(ARRAYS))
     assert {"phi [deg]", "vectors"}.isdisjoint(_curve_table([plain]).head)

@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxtrachea.mechanics.oblique import ObliqueOptions, ObliquePress, press_oblique
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.output.surface_plot import draw_surface
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import load_scene_spec
-from jaxtrachea.scene.surface_plot import draw_surface
 from jaxtrachea.trachea.geometry import TABLE_1, disc_second_moment, table_1
 from jaxtrachea.trachea.material import Material
 

@@ -35,7 +35,7 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
 
     from jaxtrachea.files.table import words
     from jaxtrachea.files.traces import Traced
-    from jaxtrachea.scene.results import plan_rows
+    from jaxtrachea.output.results import plan_rows
     from jaxtrachea.scene.simulation import simulate as run
     from jaxtrachea.tradeoff.shares import shares
 
@@ -69,7 +69,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
     from jaxtrachea.files.provenance import write_provenance
     from jaxtrachea.files.traces import Traced
-    from jaxtrachea.scene.results import (
+    from jaxtrachea.output.results import (
         last_solved,
         write_forces,
         write_simulation,
@@ -89,7 +89,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
         if spec.output.pictures:
-            load_beside("jaxtrachea.scene.surface_plot")
+            load_beside("jaxtrachea.output.surface_plot")
         with progress_bar(transient=True) as bar:
             stages = Stages(bar, stop_if_asked)
             stages.begin(f"pressing {_rows(staged)} rows; a new kind of scene is compiled first")
@@ -129,10 +129,10 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     from jaxtrachea.files.pictures import save_each
     from jaxtrachea.files.provenance import write_provenance
     from jaxtrachea.files.traces import Traced
-    from jaxtrachea.scene.plots import draw_sweep
-    from jaxtrachea.scene.results import write_sweep
+    from jaxtrachea.output.plots import draw_sweep
+    from jaxtrachea.output.results import write_sweep
+    from jaxtrachea.output.vtk_files import write_map
     from jaxtrachea.scene.sweep import sweep as run
-    from jaxtrachea.scene.vtk_files import write_map
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
@@ -148,7 +148,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     with into(out_dir, _default(scene, "-sweep")) as (folder, stop_if_asked):
         size, parts, total = want.chunk, [], len(points[0])
         compute = Traced(run, chunk=size)
-        load_beside("jaxtrachea.scene.plots")
+        load_beside("jaxtrachea.output.plots")
         with progress_bar() as bar:
             task = bar.add_task("sweeping", total=total)
             for start in range(0, total, size):
@@ -302,9 +302,9 @@ def _draw(folder: Path, title: str, pictures: bool, staged, out) -> dict[str, st
     if not pictures:
         return {}
     from jaxtrachea.files.pictures import save_each
-    from jaxtrachea.scene.plots import draw_series, draw_tools
-    from jaxtrachea.scene.results import last_solved
-    from jaxtrachea.scene.surface_plot import draw_surface
+    from jaxtrachea.output.plots import draw_series, draw_tools
+    from jaxtrachea.output.results import last_solved
+    from jaxtrachea.output.surface_plot import draw_surface
 
     shown, names = (staged.scene, staged.path, out), staged.scene.names
     drawings = {"series.png": partial(draw_series, *shown)}
@@ -321,8 +321,8 @@ def _write_surface(folder: Path, scene, out) -> None:
     """The surface of the last solved row as meshes."""
     import numpy as np
 
-    from jaxtrachea.scene.gltf import write_meshes
-    from jaxtrachea.scene.results import last_solved
+    from jaxtrachea.output.gltf import write_meshes
+    from jaxtrachea.output.results import last_solved
 
     row = last_solved(out)
     if out.vertices is not None and scene.mesh is not None and row is not None:
@@ -331,10 +331,10 @@ def _write_surface(folder: Path, scene, out) -> None:
 
 def _write_recording(folder: Path, output) -> None:
     """The simulation for other programs; nothing where no row was solved, which is said anyway."""
-    from jaxtrachea.scene.gltf import write_glb
-    from jaxtrachea.scene.read import read_simulation
-    from jaxtrachea.scene.recording import NoSurface, recording_of
-    from jaxtrachea.scene.vtk_files import write_vtk
+    from jaxtrachea.output.gltf import write_glb
+    from jaxtrachea.output.read import read_simulation
+    from jaxtrachea.output.recording import NoSurface, recording_of
+    from jaxtrachea.output.vtk_files import write_vtk
 
     try:
         recording = recording_of(read_simulation(folder / "simulation.h5"))

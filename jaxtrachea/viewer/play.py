@@ -15,9 +15,9 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.scene.read import SimulationFileError, read_simulation
-from jaxtrachea.scene.recording import MovingTool, NoSurface, recording_of
-from jaxtrachea.scene.solids import rings_on
+from jaxtrachea.output.read import SimulationFileError, read_simulation
+from jaxtrachea.output.recording import MovingTool, NoSurface, recording_of
+from jaxtrachea.output.solids import rings_on
 from jaxtrachea.viewer.frame import Frame
 from jaxtrachea.viewer.protocol import frame_of, tools_packet, tube_arrays, tube_of
 from jaxtrachea.viewer.scene import Handled

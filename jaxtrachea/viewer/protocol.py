@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.contact.shapes import Shape, parts_of
-from jaxtrachea.scene.solids import rings_on, tool_triangles
+from jaxtrachea.output.solids import rings_on, tool_triangles
 from jaxtrachea.scene.stage import Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.viewer.frame import COLOURS, Frame, Touch, packet, statuses

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxtrachea.scene.results import write_simulation
+from jaxtrachea.output.results import write_simulation
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses
 from jaxtrachea.viewer.scene import read_handled

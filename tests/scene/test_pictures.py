@@ -10,12 +10,12 @@ from matplotlib.text import Text
 
 from jaxtrachea.contact.shapes import box, capsule, sphere
 from jaxtrachea.notebook import of_scene, of_simulation
+from jaxtrachea.output.plots import draw_series
+from jaxtrachea.output.solids import crossings, tool_distance, tool_triangles
+from jaxtrachea.output.surface_plot import draw_rest, draw_surface
 from jaxtrachea.scene.build import stage
-from jaxtrachea.scene.plots import draw_series
 from jaxtrachea.scene.simulation import Simulation
-from jaxtrachea.scene.solids import crossings, tool_distance, tool_triangles
 from jaxtrachea.scene.spec import load_scene_spec
-from jaxtrachea.scene.surface_plot import draw_rest, draw_surface
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.mesh import volume
 

@@ -9,8 +9,8 @@ import pytest
 from small_scenes import BALL, MATERIAL, MESH, OUTER, TUBE, ball
 
 import jaxtrachea as jt
-from jaxtrachea.scene.read import SimulationFileError
-from jaxtrachea.scene.results import plan_rows, write_simulation
+from jaxtrachea.output.read import SimulationFileError
+from jaxtrachea.output.results import plan_rows, write_simulation
 
 pytestmark = pytest.mark.long
 

@@ -10,14 +10,14 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from jaxtrachea.contact.shapes import Shape, sphere
-from jaxtrachea.scene.gltf import write_glb
-from jaxtrachea.scene.read import StoredSimulation
-from jaxtrachea.scene.recording import NoSurface, recording_of
+from jaxtrachea.output.gltf import write_glb
+from jaxtrachea.output.read import StoredSimulation
+from jaxtrachea.output.recording import NoSurface, recording_of
+from jaxtrachea.output.vtk_files import write_map, write_vtk
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.spec import OutputSection
 from jaxtrachea.scene.stage import Poses
 from jaxtrachea.scene.sweep import Sweep
-from jaxtrachea.scene.vtk_files import write_map, write_vtk
 from jaxtrachea.trachea.mesh import Mesh
 
 ROWS = 4

@@ -33,11 +33,11 @@ from jaxtrachea import (
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.contact.shapes import box, compound, sphere
 from jaxtrachea.mechanics.levels.options import Options
+from jaxtrachea.output.results import write_forces, write_simulation
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.dents import fit, lay_out
 from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.overlap import overlapping
-from jaxtrachea.scene.results import write_forces, write_simulation
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import of_tool
 from jaxtrachea.scene.spec import SceneSpec

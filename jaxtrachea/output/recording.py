@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.scene.read import StoredSimulation
-from jaxtrachea.scene.solids import Triangles, nearest_vertices, rings_on, tool_triangles
+from jaxtrachea.output.read import StoredSimulation
+from jaxtrachea.output.solids import Triangles, nearest_vertices, rings_on, tool_triangles
 from jaxtrachea.scene.stage import Poses
 
 

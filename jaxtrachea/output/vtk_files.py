@@ -11,7 +11,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from jaxtrachea.files.atomic import write_text
-from jaxtrachea.scene.recording import Recording
+from jaxtrachea.output.recording import Recording
 from jaxtrachea.scene.sweep import Sweep
 from jaxtrachea.trachea.mesh import Mesh
 

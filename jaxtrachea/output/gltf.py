@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.files.atomic import write_whole
-from jaxtrachea.scene.recording import Recording
+from jaxtrachea.output.recording import Recording
 from jaxtrachea.trachea.mesh import vertex_normals
 
 #: Rows at most: viewers hold a few hundred targets.

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.scene.results import SCHEMA, SCHEMA_VERSION
+from jaxtrachea.output.results import SCHEMA, SCHEMA_VERSION
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses
 

@@ -20,9 +20,9 @@ from matplotlib.patches import Patch
 from matplotlib.path import Path
 
 from jaxtrachea.files.pictures import plain
+from jaxtrachea.output.solids import Triangles, crossings, tool_distance, tool_triangles
 from jaxtrachea.scene.instruments import scene_of
 from jaxtrachea.scene.simulation import Simulation, of_tool
-from jaxtrachea.scene.solids import Triangles, crossings, tool_distance, tool_triangles
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.mesh import Mesh
