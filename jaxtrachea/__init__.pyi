@@ -40,6 +40,7 @@ from .mechanics.press_in_time import press_in_time as press_in_time
 from .mechanics.skeleton import Skeleton as Skeleton
 from .mechanics.skeleton import skeleton_response as skeleton_response
 from .notebook import load_ipython_extension as load_ipython_extension
+from .output.read import read_simulation as read_simulation
 from .prediction.curves import CurvePrediction as CurvePrediction
 from .prediction.predict import predict as predict
 from .relaxation.filter import Relaxation as Relaxation
@@ -51,7 +52,6 @@ from .scene.assemble import with_geometry as with_geometry
 from .scene.declare import PlanError as PlanError
 from .scene.effects import EffectOptions as EffectOptions
 from .scene.plan import Plan as Plan
-from .output.read import read_simulation as read_simulation
 from .scene.session import Session as Session
 from .scene.simulation import Simulation as Simulation
 from .scene.simulation import simulate as simulate
