@@ -241,7 +241,9 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
         lines.append((len(names), _line(quoted(row.get(name)) for name in names)))
     with path.open("w", encoding="utf-8", newline="") as stream:
         stream.write(_line(map(quoted, names)) + "\r\n")
-        stream.writelines(f"{line}{',' * (len(names) - known)}\r\n" for known, line in lines)
+        stream.writelines(
+            f"{line}{',' * (len(names) - max(known, 1))}\r\n" for known, line in lines
+        )
 
 
 def _line(cells: Iterable[object]) -> str:

@@ -139,7 +139,7 @@ def slide_together(
     solved = failed == PressStatus.OK
     lifted = (status == PressStatus.NO_CONTACT) & (displacement[:, 0] > 0)
     status = jnp.where(lifted, PressStatus.LIFTED, status)
-    after = Stand(slip, above, jax.lax.stop_gradient(found.force))
+    after = Stand(slip, above, found.force)
     after = jax.tree.map(lambda new, old: jnp.where(solved, new, old), after, before)
     depth, force, lost = (
         jnp.where(solved, v, jnp.nan) for v in (found.depth, found.force, found.dissipated)
@@ -175,9 +175,10 @@ def slide_paths(
     def step(state, row):
         (before, met, began), (D, lands) = state, row
         if lands is not None:
-            anew, moved = lands & (before.above > 0), moved_by_others(compliance, before.force)
+            moved = moved_by_others(compliance, before.force)
+            anew = lands & (before.above > 0) & (moved[:, 0] >= 0)
             slip = jnp.where(anew[:, None], -moved[:, 1:], before.slip)
-            above = jnp.where(anew, jnp.maximum(moved[:, 0], 0), before.above)
+            above = jnp.where(anew, moved[:, 0], before.above)
             before = Stand(slip, above, before.force)
         after, slid = slide_together(D, compliance, law, friction, before)
         began = jnp.where(met[:, None], began, slid.began)

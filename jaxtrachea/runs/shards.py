@@ -105,7 +105,11 @@ def free_memory(workers: int) -> float:
 
 
 def join(study: Study, parts: Iterable[FitResult]) -> FitResult:
-    """One result out of those of consecutive lanes; `study` holds all of them."""
+    """One result out of those of consecutive lanes; `study` holds all of them.
+
+    Raises:
+        ValueError: the parts are not those of all lanes.
+    """
     arrays: dict[str, np.ndarray] = {}
     weighed, end = False, 0
     for part in parts:  # one after the other: together they are as large as the study
@@ -114,7 +118,11 @@ def join(study: Study, parts: Iterable[FitResult]) -> FitResult:
         for name, values in arrays_of(part, weighed=True).items():
             if name not in arrays:
                 arrays[name] = np.empty((len(study.curves), *values.shape[1:]), values.dtype)
+            if values.shape[1:] != arrays[name].shape[1:]:
+                raise ValueError(f"{name} has shape {values.shape} in lanes from {start}")
             arrays[name][start:end] = values
+    if end != len(study.curves):
+        raise ValueError(f"{end} lanes; expected {len(study.curves)}")
     names = [n for n in arrays if weighed or not n.startswith("shares.")]
     return result_of(study, {n: arrays[n] for n in names})
 

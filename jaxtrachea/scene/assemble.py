@@ -132,7 +132,7 @@ def make_scene(
     )  # fmt: skip
     each = [scene_of(scene, instrument) for instrument in instruments]
     facts = facts_together([
-        facts_of(view, material, paths[name], bonded=kinds[name] == "bonded")
+        facts_of(view, material, paths[name], bonded=kinds[name] == "bonded", several=len(each) > 1)
         for view, name in zip(each, kinds, strict=True)
     ], glued=mixed)  # fmt: skip
     if isinstance(path, Mapping):
@@ -182,12 +182,15 @@ def _named(path, tool) -> tuple[dict[str, Poses | Presses], dict[str, Tool]]:
 def _check_friction(tools: Mapping[str, Tool], effects: EffectOptions) -> None:
     """Refuse friction of some tools alone: no rule may leave out what is given."""
     without = [name for name, tool in tools.items() if tool.friction is None]
-    if 0 < len(without) < len(tools) and effects.friction == "auto":
+    glued = [n for n, t in tools.items() if (t.contact or effects.contact) == "bonded"]
+    why, cure = "", "leave tool.friction out, or set friction 'off'"
+    if glued and effects.friction != "off":
+        why = f"tool {glued[0]!r}" if glued[0] else "the tool"
+        why += " is glued, and friction beside glued tools, or of one, is not derived"
+    elif without and effects.friction == "auto":
         why = f"tool {without[0]!r} has none"
         cure = "give each tool its friction (0: it slides freely), or set friction 'off'"
-        if glued := [n for n in without if (tools[n].contact or effects.contact) == "bonded"]:
-            why = f"beside tool {glued[0]!r}, which is glued, none is derived"
-            cure = "leave tool.friction out (tools slide freely), or set friction 'off'"
+    if why and len(without) < len(tools):
         raise PlanError("friction", "a tool has a coefficient", why, cure)
 
 

@@ -72,8 +72,8 @@ def _friction(case: Case) -> Verdict:
     elif options.contact != "unilateral" or options.coupling != "series":
         cannot = "it needs contact 'unilateral' and coupling 'series'"
     moves, reason = facts.slip > 0, "the tool moves along the surface"
-    if not moves and facts.friction and facts.tools > 1:
-        moves, reason = True, "each tool may drag the wall along under the others"
+    if not moves and facts.friction and facts.tools > 1 and facts.along + facts.across > 0:
+        moves, reason = True, "a tool moves along the wall that others may raise to it"
     elif not moves and facts.friction and facts.angle > 0:
         # Whatever the coefficient: one that is 0 would be held, too.
         moves, reason = True, "off the midline the skeleton moves along the surface under the tool"

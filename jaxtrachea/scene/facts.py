@@ -33,9 +33,14 @@ from jaxtrachea.trachea.material import DEEP
 MIN_ROWS, MAX_ROWS = 64, 4096
 
 
+#: Others may raise the wall to a tool that is clear of it at rest by so much of the tube's radius.
+RAISED = 0.25
+
+
 def facts_of(
-    scene: Scene, material: AnyMaterial, path: Poses | Presses, *, bonded: bool = False
-) -> SceneFacts:
+    scene: Scene, material: AnyMaterial, path: Poses | Presses, *, bonded: bool = False,
+    several: bool = False,
+) -> SceneFacts:  # fmt: skip
     """What the rules need to know of a scene and its path; rows in the lumen touch nothing.
 
     What one row needs (`needs`) the path does, so that its plan serves it.
@@ -45,6 +50,7 @@ def facts_of(
         material: read only for which optional values are there.
         path: what the plan is made for.
         bonded: the tool sticks to the wall: it draws, too.
+        several: others press beside it.
     """
     curved = scene.mesh is not None and scene.mesh.frames is not None
     if isinstance(path, Poses):
@@ -66,7 +72,10 @@ def facts_of(
     # Rows that press one place, and those that press each its own; not what goes before.
     held = touching | (outside & ((moved != 0).any(axis=1) if bonded else inward > 0))
     own = outside if bonded else touching
+    near = outside & (gap < RAISED * float(scene.radius)) if several else held
+    near = near | held
     motion = motion_of(s[held], here[held], moved[held], np)
+    beside = motion_of(s[near], here[near], moved[near], np)
     whole = max(_largest(motion.length), 1e-9)
 
     radius = float(level_type(material).wall_radius(scene.geometry, scene.radius))
@@ -81,14 +90,14 @@ def facts_of(
     def largest(v, needed):
         return _largest(v[needed])
 
-    angles = np.concatenate([phi[own], np.ravel(here[held])])
+    angles = np.concatenate([phi[own], np.ravel(here[near])])
     x = np.asarray(scene.geometry.ring_positions, float)
     return SceneFacts(
         poses=isinstance(path, Poses),
         angle=largest(abs(angles), off_midline(angles, PLANNED)),
         several_points=bool(elsewhere(motion._replace(phi=phi[held]), PLANNED).any()),
-        along=largest(motion.along, axial(motion, PLANNED)) / whole,
-        across=largest(motion.across, lateral(motion, PLANNED)) / whole,
+        along=largest(beside.along, axial(beside, PLANNED)) / whole,
+        across=largest(beside.across, lateral(beside, PLANNED)) / whole,
         slip=largest(motion.slip, slides(motion, PLANNED)),
         drags=bool(drags(motion, PLANNED).any()),
         spacing=float(np.diff(x).min()) if len(x) > 1 else float(scene.geometry.length),

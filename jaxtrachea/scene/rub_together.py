@@ -83,7 +83,11 @@ def rub_paths(
         made: their ways; None: presses.
     """
     unit, row, lands = influence_of(scene, material, s, phi), jnp.arange(len(hidden)), None
-    if firsts := [m.first for m in made if m is not None and m.first is not None]:
+    firsts = [
+        jnp.where(m.seen.gap[m.first] < 0, m.first, -1)  # none: it never touches the wall at rest
+        for m in made if m is not None and m.first is not None
+    ]  # fmt: skip
+    if firsts:
         lands = row[:, None] == jnp.stack(firsts)[None]
     D = jnp.stack([_in_its_frame(p, hidden) for p in presses], axis=1)
     D = jnp.where(hidden[:, None, None], jnp.nan, smooth_touch(D, scene.plan.options))
@@ -104,11 +108,30 @@ def _stand(scene: Scene, unit: VectorInfluence, led: Led, before: Float[Array, "
         before: forces before the step, in the directions of the contacts.
     """
     moved = moved_by_others(felt(scene, unit), jnp.where(jnp.isfinite(before), before, 0))
-    lands = led.touching & ~led.on  # its way counts from the wall at rest
-    above = jnp.maximum(moved[:, 0] - jnp.where(lands, 0, led.before[:, 0]), 0)
+    # Its way counts from the wall at rest, but where others have raised that: it came to it before.
+    lands = led.touching & ~led.on
+    met = lands & (moved[:, 0] < 0) & _is_a_way(scene, led)
+    above = jnp.maximum(moved[:, 0] - jnp.where(lands & ~met, 0, led.before[:, 0]), 0)
     clear = ~(led.on & (before[:, 0] > 0))
-    slip = jnp.where(led.on[:, None], 0, -moved[:, 1:])
+    came = jnp.where(met[:, None], led.before[:, 1:], 0)
+    slip = jnp.where(led.on[:, None], 0, came - moved[:, 1:])
     return Stand(slip, jnp.where(clear, above, 0), jnp.zeros_like(before))
+
+
+def _waiting(scene: Scene, led: Led, present: Bool[Array, " m"]) -> Led:
+    """The tools, those that do not touch the wall at rest with their way along it in this step.
+
+    Others may raise the wall to them within the step. A jump is no way.
+    """
+    waits = ~led.touching & present & _is_a_way(scene, led)
+    way = jnp.concatenate([led.way[:, :1], -led.before[:, 1:]], axis=1)
+    return led._replace(way=jnp.where(waits[:, None], way, led.way))
+
+
+def _is_a_way(scene: Scene, led: Led) -> Bool[Array, " m"]:
+    """Whether the tools did not jump in this step."""
+    way = led.way - led.before
+    return jnp.sum(way * way, axis=1) <= scene.radius**2
 
 
 def rub_step(
@@ -137,6 +160,8 @@ def rub_step(
         return lead(view, row.state, last, here, place, hit)
 
     led = jax.lax.map(take, rows)
+    shown = jax.vmap(whole_way)(led)
+    led = _waiting(scene, led, rows.state.present)
     places = jax.vmap(lambda s, phi: on_the_tube(scene, s, phi)[:2])(led.anchor.s, led.anchor.phi)
     frames = jax.vmap(local_frame)(led.anchor.phi)
     unit, law = influence_of(scene, material, *places), law_of(scene, material, places[0])
@@ -159,10 +184,10 @@ def rub_step(
     answers = Answer(law, force, depth, skeleton, sunk, slid.slip, slid.dissipated, began)
 
     def leave(row):
-        row, led, answer = row
+        row, led, shown, answer = row
         view, here, side, inside = enter(first, row)
         after, total, lost = let_go(view, led, answer, here)
-        _, made = as_approach(view, led.anchor, whole_way(led), here, inside)
+        _, made = as_approach(view, led.anchor, shown, here, inside)
         # On its place, too, where it does not touch the wall at rest, but one that others raise.
         bears = jnp.sum(local_frame(led.anchor.phi)[0] * answer.force) > 0
         on = bears | (row.seen.gap[0] < 0) & ~inside[0]
@@ -172,7 +197,7 @@ def rub_step(
         )  # fmt: skip
         return pick(known, new, row.state), made, total, lost
 
-    after, made, total, lost = jax.lax.map(leave, (rows, led, answers))
+    after, made, total, lost = jax.lax.map(leave, (rows, led, shown, answers))
     slid = slid._replace(slip=total.held, dissipated=lost, began=jnp.zeros_like(total.held))
     whole = jnp.einsum("mk,mkx->mx", total.held + total.before, frames[:, 1:])
     return after, made, Rubbed(unit, jax.tree.map(lambda v: v[None], slid)), whole

@@ -188,7 +188,7 @@ def _reached_beyond(
     for j, (view, (presses, _, inward, _), way) in enumerate(zip(each, found, made, strict=True)):
         if way is None:
             continue
-        reached = (force[:, j] != 0) & (jnp.sum(presses.displacement * inward, axis=1) <= 0)
+        reached = (jnp.abs(force[:, j]) > 0) & (jnp.sum(presses.displacement * inward, axis=1) <= 0)
         for code, rows in beyond(view, material, presses, way, reached, reached).items():
             refused[code] = refused.get(code, False) | rows
     return refused

@@ -269,8 +269,8 @@ def test_a_row_that_is_refused_has_no_numbers_and_no_derivatives():
         ({"slip": 1.0, "along": 0.5, "friction": True, "drags": True,
           "known": frozenset({"EA_L"})}, ("on", "on", "coupled")),
         ({"angle": 1.0, "slip": 0.0, "friction": True}, ("on", "off", "coupled")),
-        ({"friction": True}, ("on", "off", "coupled")),
-        ({}, ("off", "off", "coupled")),
+        ({"along": 0.1, "friction": True, "known": frozenset({"EA_L"})}, ("on", "on", "coupled")),
+        ({"friction": True}, ("off", "off", "coupled")),
     ],
 )  # fmt: skip
 def test_plans_with_friction(facts, levels):
@@ -295,7 +295,7 @@ def test_what_is_glued_has_no_friction():
     with pytest.raises(ValueError, match="friction is 0.3, and contact is 'bonded'"):
         Tool(BALL, 0.3, "bonded")
     tools = TOOLS | {"right": Tool(BALL, contact="bonded")}
-    with pytest.raises(PlanError, match="beside tool 'right', which is glued, none is derived"):
+    with pytest.raises(PlanError, match="tool 'right' is glued, and friction beside"):
         make_scene(TUBE, MATERIAL, PATHS, tool=tools, effects=BARE)
 
 

@@ -48,7 +48,8 @@ def unit_of(group: Any, name: str) -> str | None:
     Raises:
         Fault: the attribute is no text, or the two differ.
     """
-    texts = {text_attribute(group[name], key) for key in ("unit", "units")} - {None}
+    dataset = group[name]
+    texts = {text_attribute(dataset, key) for key in ("unit", "units")} - {None}
     if len(texts) > 1:
         raise Fault(
             "unit_unknown", f"{name!r} has two units, {sorted(map(str, texts))}", "remove one"
