@@ -148,6 +148,21 @@ def test_a_row_in_which_one_is_refused_has_no_numbers():
     assert (np.asarray(out.status)[1:] == PressStatus.OFF_TUBE).all()
 
 
+@pytest.mark.long
+def test_past_the_fold_stays_so_whatever_waits_in_the_air():
+    """Behind the ends of the rings no force of others puts the waiting tool anywhere."""
+    down = [[75, OUTER + 6 - d, 0] for d in (0, 1.5, 3, 4)]
+    paths = {
+        name: Poses(np.broadcast_to(np.eye(3), (4, 3, 3)), np.array(at, float))
+        for name, at in (("a", down), ("b", [[60, -(OUTER + 7.0), 0.5]] * 4))
+    }
+    tools = dict.fromkeys(paths, BALL)
+    scene = make_scene(TUBE, SPRINGS, paths, tool=tools, effects=EffectOptions(want_surface=False))
+    out = jax.jit(simulate)(scene, dataclasses.replace(SPRINGS, k_3=-0.5), paths)
+    assert out.status[1].tolist() == [OK, NO_CONTACT]
+    assert (np.asarray(out.status)[2:] == PressStatus.PAST_FOLD).all()
+
+
 @pytest.mark.slow
 def test_glued_tools_and_widths():
     model = {"contact": "bonded", "half_width": 2.0}

@@ -185,6 +185,8 @@ def test_a_tool_that_is_only_reached_by_a_raised_wall_sticks_to_it():
         "right": led(np.stack([35 + aside, high * np.cos(phi), high * np.sin(phi)], axis=1)),
     }
     out = jax.device_get(program(False)(stiff, paths))
+    own = make_scene(TUBE, stiff, paths, tool=TOOLS, effects=BARE).plan
+    assert own == scene(False).plan  # the plan of a path serves it
     assert out.gap[:, 1].min() > 0.005
     assert np.abs(out.force[-1, 1, 0]) > 0.1 * np.abs(out.force[-1, 1, 1])
     assert np.ptp(out.force[6:, 1, 0]) > 1e-3
@@ -243,11 +245,22 @@ def slopes():
 VALUES = np.array([1.86, 3.9, 0.3])
 
 
+def one_lands_later():
+    """The right one comes down on a wall that the left one has pressed and dragged."""
+    t = np.linspace(0, 1, 4)[:, None]
+    down = [62, OUTER + 5.5, 0] + t * [0, -3.5, 0]
+    drag = down[-1] + t * [2, 0, 0]
+    wait = np.repeat([[77, OUTER + 5.5, 0]], 8, axis=0)
+    left = np.concatenate([down, drag, np.repeat(drag[-1:], 4, axis=0)])
+    return {"left": led(left), "right": led(np.concatenate([wait, wait[:4] + t * [0, -3, 0]]))}
+
+
 @long
-def test_gradients_of_a_path_are_those_of_differences():
-    by = slopes()(VALUES, PATHS)[1]
+@pytest.mark.parametrize("paths", [PATHS, one_lands_later()], ids=["side by side", "later"])
+def test_gradients_of_a_path_are_those_of_differences(paths):
+    by = slopes()(VALUES, paths)[1]
     for i, h in enumerate(np.eye(3) * 1e-6):
-        (high, _), (low, _) = (slopes()(VALUES + sign * h, PATHS)[0] for sign in (1, -1))
+        (high, _), (low, _) = (slopes()(VALUES + sign * h, paths)[0] for sign in (1, -1))
         slope = (high - low) / 2e-6
         assert abs(by[i] - slope) < 1e-6 * max(1, abs(slope))
 
