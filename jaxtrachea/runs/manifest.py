@@ -175,7 +175,7 @@ def from_dict(content: object) -> Manifest:
     if (found.pop("schema", None), found.pop("schema_version", None)) != (SCHEMA, SCHEMA_VERSION):
         raise ValueError("not the manifest of a run, or one of another version")
     try:
-        return _KIND.validate_python(found)
+        return _KIND.validate_json(json.dumps(found))
     except ValidationError as error:
         key = ".".join(map(str, error.errors()[0]["loc"]))
         raise ValueError(f"not the manifest of a run: {key}: {error.errors()[0]['msg']}") from None
