@@ -326,7 +326,7 @@ def _frame_view(axis: Any, camera: np.ndarray, frame: np.ndarray, low, high) -> 
     _draw_scale(axis, camera, frame, low, high)
 
 
-def _segments(ends: np.ndarray, colour: str, zorder: float = 2, **style: Any) -> PathCollection:
+def _segments(ends: np.ndarray, colour: str, zorder: float = 2.0, **style: Any) -> PathCollection:
     """Segments of shape (segments, 2, 2) as one path: thousands of paths take a while."""
     path = Path(ends.reshape(-1, 2), np.tile([Path.MOVETO, Path.LINETO], len(ends)))
     return PathCollection([path], facecolors="none", edgecolors=colour, zorder=zorder, **style)
@@ -448,7 +448,7 @@ def _lines(axis: Any, wall: Triangles, rest, tool, point, normal, axes):
     axis.add_collection(_segments(ends, "k", linewidths=1.3))
     if tool is not None:
         _, cut = _section(tool, point, normal, axes)
-        axis.add_collection(_segments(cut, TOOL, linewidths=1.4, zorder=3))
+        axis.add_collection(_segments(cut, TOOL, linewidths=1.4, zorder=3.0))
     return found, ends
 
 
