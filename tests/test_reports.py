@@ -126,6 +126,14 @@ def test_formulas_are_quoted_and_read_back(tmp_path):
     assert (read.specimen, read.trial) == ("=1+1", "-2")
 
 
+def test_rows_of_unlike_cells_have_all_columns(tmp_path):
+    Table([{}, {"a": 1.5}, {"b": 2.5}, {}]).write_csv(tmp_path / "t.csv")
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    assert lines[0] == "a,b"
+    cells = list(csv.reader(lines[1:]))
+    assert cells == [["", ""], ["1.5", ""], ["", "2.5"], ["", ""]]
+
+
 def test_summary_quotes_what_specimens_are_called(many, tmp_path):
     Table(lane_rows(many)).write_csv(tmp_path / "s.csv")
     with (tmp_path / "s.csv").open(newline="", encoding="utf-8") as stream:

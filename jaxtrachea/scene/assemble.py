@@ -180,7 +180,7 @@ def _named(path, tool) -> tuple[dict[str, Poses | Presses], dict[str, Tool]]:
 
 
 def _check_friction(tools: Mapping[str, Tool], effects: EffectOptions) -> None:
-    """Refuse friction of some tools alone: no rule may leave out what is given."""
+    """Refuse friction of some tools alone, or with glued ones: none that is given is left out."""
     without = [name for name, tool in tools.items() if tool.friction is None]
     glued = [n for n, t in tools.items() if (t.contact or effects.contact) == "bonded"]
     why, cure = "", "leave tool.friction out, or set friction 'off'"

@@ -72,8 +72,7 @@ def facts_of(
     # Rows that press one place, and those that press each its own; not what goes before.
     held = touching | (outside & ((moved != 0).any(axis=1) if bonded else inward > 0))
     own = outside if bonded else touching
-    near = outside & (gap < RAISED * float(scene.radius)) if several else held
-    near = near | held
+    near = held | (several & outside & (gap < RAISED * float(scene.radius)))
     motion = motion_of(s[held], here[held], moved[held], np)
     beside = motion_of(s[near], here[near], moved[near], np)
     whole = max(_largest(motion.length), 1e-9)

@@ -110,7 +110,7 @@ def _stand(scene: Scene, unit: VectorInfluence, led: Led, before: Float[Array, "
     moved = moved_by_others(felt(scene, unit), jnp.where(jnp.isfinite(before), before, 0))
     # Its way counts from the wall at rest, but where others have raised that: it came to it before.
     lands = led.touching & ~led.on
-    met = lands & (moved[:, 0] < 0) & _is_a_way(scene, led)
+    met = lands & (moved[:, 0] < 0) & _goes_on(scene, led)
     above = jnp.maximum(moved[:, 0] - jnp.where(lands & ~met, 0, led.before[:, 0]), 0)
     clear = ~(led.on & (before[:, 0] > 0))
     came = jnp.where(met[:, None], led.before[:, 1:], 0)
@@ -118,17 +118,17 @@ def _stand(scene: Scene, unit: VectorInfluence, led: Led, before: Float[Array, "
     return Stand(slip, jnp.where(clear, above, 0), jnp.zeros_like(before))
 
 
-def _waiting(scene: Scene, led: Led, present: Bool[Array, " m"]) -> Led:
+def _with_ways_in_the_air(scene: Scene, led: Led, present: Bool[Array, " m"]) -> Led:
     """The tools, those that do not touch the wall at rest with their way along it in this step.
 
     Others may raise the wall to them within the step. A jump is no way.
     """
-    waits = ~led.touching & present & _is_a_way(scene, led)
+    waits = ~led.touching & present & _goes_on(scene, led)
     way = jnp.concatenate([led.way[:, :1], -led.before[:, 1:]], axis=1)
     return led._replace(way=jnp.where(waits[:, None], way, led.way))
 
 
-def _is_a_way(scene: Scene, led: Led) -> Bool[Array, " m"]:
+def _goes_on(scene: Scene, led: Led) -> Bool[Array, " m"]:
     """Whether the tools did not jump in this step."""
     way = led.way - led.before
     return jnp.sum(way * way, axis=1) <= scene.radius**2
@@ -161,7 +161,7 @@ def rub_step(
 
     led = jax.lax.map(take, rows)
     shown = jax.vmap(whole_way)(led)
-    led = _waiting(scene, led, rows.state.present)
+    led = _with_ways_in_the_air(scene, led, rows.state.present)
     places = jax.vmap(lambda s, phi: on_the_tube(scene, s, phi)[:2])(led.anchor.s, led.anchor.phi)
     frames = jax.vmap(local_frame)(led.anchor.phi)
     unit, law = influence_of(scene, material, *places), law_of(scene, material, places[0])

@@ -40,6 +40,8 @@ def test_results_are_read_back_bit_for_bit(peace, tmp_path):
         assert array.tobytes() == expected[name].tobytes(), name
     parts = [shards.load(path, "me", lanes, study) for _ in range(2)]
     assert shards.join(study.take(np.tile(lanes, 2)), parts).lanes == 18
+    with pytest.raises(ValueError, match="9 lanes; expected 18"):
+        shards.join(study.take(np.tile(lanes, 2)), parts[:1])
     assert shards.load(path, "another", lanes, study) is None
     assert shards.load(path, "me", lanes[::-1], study) is None
     whole = path.read_bytes()
