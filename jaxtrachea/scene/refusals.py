@@ -53,8 +53,8 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
     acting = pressing
     if scene.plan.options.contact == "bonded":
         acting = ~jnp.all(D == 0, axis=1)
-    refused = beyond(scene, material, presses, made, pressing, acting)
     s, mid, behind = on_the_tube(scene, presses.s, phi)
+    refused = beyond(scene, material, presses, made, behind, pressing, acting)
     if made is not None:
         refused[PressStatus.IN_LUMEN] = made.inside
     number = jnp.sum(D, axis=1) + presses.s + phi
@@ -76,7 +76,7 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
 
 def beyond(
     scene: Scene, material: AnyMaterial, presses: Presses, made: Approach | None,
-    pressing: Bool[Array, " rows"], acting: Bool[Array, " rows"],
+    behind: Bool[Array, " rows"], pressing: Bool[Array, " rows"], acting: Bool[Array, " rows"],
 ) -> dict[PressStatus, Bool[Array, " rows"]]:  # fmt: skip
     """Rows that press where there is no tube or no ring, or need what the plan has not, by status.
 
@@ -85,6 +85,7 @@ def beyond(
         material: -
         presses: of every row.
         made: how a tool comes to them; None: they are given, and off the tube pressing or not.
+        behind: which rows lie between the ends of the rings (`on_the_tube`).
         pressing: which rows press.
         acting: which press or draw.
     """
@@ -96,7 +97,7 @@ def beyond(
     unlike = outside_plan(scene, material, presses, acting)
     if unlike is not None:
         refused[PressStatus.OFF_PLAN] = unlike
-    refused[PressStatus.BEHIND_GAP] = on_the_tube(scene, presses.s, presses.phi)[2] & acting
+    refused[PressStatus.BEHIND_GAP] = behind & acting
     return refused
 
 

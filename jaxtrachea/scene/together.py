@@ -33,6 +33,7 @@ from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import (
     beyond,
     mask_rows,
+    on_the_tube,
     refuse,
     status_of,
     without_negative_values,
@@ -189,7 +190,8 @@ def _reached_beyond(
         if way is None:
             continue
         reached = (jnp.abs(force[:, j]) > 0) & (jnp.sum(presses.displacement * inward, axis=1) <= 0)
-        for code, rows in beyond(view, material, presses, way, reached, reached).items():
+        behind = on_the_tube(view, presses.s, presses.phi)[2]
+        for code, rows in beyond(view, material, presses, way, behind, reached, reached).items():
             refused[code] = refused.get(code, False) | rows
     return refused
 
