@@ -13,6 +13,7 @@ from run_cli import GOOD, run, tree
 
 import jaxtrachea
 from jaxtrachea.cli.terminal import into
+from jaxtrachea.config import SpecError, load_fit_spec
 from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
 from jaxtrachea.fitting import fit as fit_module
@@ -247,6 +248,22 @@ def study(tmp_path):
     (tmp_path / "good.csv").write_text(GOOD)
     (tmp_path / "spec.toml").write_text(DATA + '[model]\ncoupling = "total"')
     return tmp_path
+
+
+@pytest.mark.parametrize("old", ["good.csv", "spec.toml"])
+def test_names_that_no_report_can_hold(old, study, monkeypatch, capsys):
+    (study / "spec.toml").write_text(DATA.replace("good", "*"))
+    name = os.fsdecode(b"g\xfcd" + Path(old).suffix.encode())
+    try:
+        (study / old).rename(study / name)
+    except OSError:
+        pytest.skip("this file system takes names in UTF-8 alone")
+    if old == "good.csv":
+        says = ["data.files.0", r"g\udcfcd.csv", "is not UTF-8", "rename it"]
+        complains(monkeypatch, capsys, study, says, "fit", "spec.toml")
+    else:
+        with pytest.raises(SpecError, match="its name is not UTF-8; rename it"):
+            load_fit_spec(study / name)
 
 
 def test_output_that_exists_is_refused_before_fitting(study, monkeypatch, capsys):

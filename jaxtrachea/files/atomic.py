@@ -126,3 +126,12 @@ def hdf5_file(path: Path) -> Iterator[Any]:
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
     path.write_text(text, encoding="utf-8")
+
+
+def is_utf8(path: Path) -> bool:
+    """Whether a path is text in UTF-8; no report or manifest can name another."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -9,6 +9,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import BaseModel, ValidationError
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.files.atomic import is_utf8
 
 Spec = TypeVar("Spec", bound=BaseModel)
 #: Longest specification that is read.
@@ -78,6 +79,8 @@ def read_tables(path: Path, called: str) -> dict[str, Any]:
 
 def _text(path: Path, called: str) -> str:
     """Content of a specification."""
+    if not is_utf8(path):
+        raise SpecError("its name is not UTF-8", place=str(path), cure="rename it")
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise SpecError("is a device or a pipe", place=str(path), expected=f"a TOML {called}")

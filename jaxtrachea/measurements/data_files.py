@@ -10,6 +10,7 @@ from pathlib import Path
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, SpecError
+from jaxtrachea.files.atomic import is_utf8
 from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.names import appearance
 from jaxtrachea.measurements.read import (
@@ -33,7 +34,7 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
     """Files of `data.files`, patterns expanded, sorted within each pattern.
 
     Raises:
-        SpecError: a path or pattern matches nothing.
+        SpecError: a path or pattern matches nothing, or a file whose name is not UTF-8.
     """
     found: dict[Path, None] = {}
     for i, pattern in enumerate(spec.data.files):
@@ -52,6 +53,9 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
             elif matches[0].is_dir():
                 what = "a folder; list the files in it, as in 'folder/*.csv'"
             raise SpecError(f"data.files.{i}: {_short(pattern)} matches in {root} {what}")
+        for path in files:
+            if not is_utf8(path):
+                raise SpecError(f"data.files.{i}: the name {str(path)!a} is not UTF-8; rename it")
         found.update(dict.fromkeys(files))
     return list(found)
 
