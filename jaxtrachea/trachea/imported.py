@@ -8,6 +8,7 @@ is refused.
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -127,35 +128,13 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     def step():
         return None if progress is None else progress(1, STEPS)
 
-    parts = parts_of(path)
-    step()
-    surfaces, surface_of = joined(parts)
-    name = wall_of(surfaces, None if part is None else surface_of.get(part, part))
-    pieces = [piece for piece in parts if surface_of[piece] == name and piece != name]
-    notes = [f"wall: {', '.join([name, *pieces])}"] if len(parts) > 1 else []
-    own = rings_named(parts, name, rings)
-    of_rings = None if own is None else surface_of.get(own)
-    check_left_out(surfaces, name, of_rings, part is not None, notes)
-    surface, cleaned = clean(surfaces[name])
-    step()
-    scale = scale_of(surface, path, unit, notes)
-    wall = Surface(surface.vertices * scale, surface.faces)
-    cartilage = cartilage_of(parts, own, path, scale, notes)
-    given = None
-    if known.centreline is not None:
-        given = np.asarray(known.centreline, float) * scale
+    file = _surfaces(path, unit, part, rings, step)
+    wall, cartilage, scale, notes = file
+    given = None if known.centreline is None else np.asarray(known.centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
     check_turn(line)
     step()
-
-    def scan(line):
-        return Shape.scan(line, wall.vertices, wall.faces, cartilage)
-
-    if known.larynx is not None:
-        shape = scan(turned(line) if _points_back(line, known.larynx) else line)
-    else:
-        shape = scan(line)
-        shape = scan(turned(line)) if _carina_is_last(shape) else shape
+    shape = _turned_up(line, file, known.larynx)
     if given is None:
         shape.check_middle()
     step()
@@ -166,23 +145,14 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     if cartilage is not None:
         holes = holes_of(join_corners(cartilage)[0], shape.line)
     found = find_rings(shape, known.ring_positions, known.half_angle, holes)
-    where = locate(shape.line, wall.vertices)
-    chord = shape.line.points[-1] - shape.line.points[0]
-    rotation = _axes(chord, shape.line.frames[:, :, 1].mean(axis=0))
-    origin = shape.line.points[0]
-    vertices = (wall.vertices - origin) @ rotation.T
-    frames = rotation @ where.frames
-    normals = vertex_normals(vertices, wall.faces)
-    notes += [*cleaned, *found.notes]
+    rotation, origin, arrays = _in_tube_frame(shape, wall)
     dtype = float_dtype(dtype)
-    fields = (normals, where.s, where.phi, where.distance, frames)
 
     def cast(v):
         return jax.device_put(np.asarray(v, dtype))  # nothing is compiled
 
-    mesh = Mesh(
-        cast(vertices), jax.device_put(np.asarray(wall.faces, np.int32)), *(cast(v) for v in fields)
-    )
+    vertices, *others = map(cast, arrays)
+    mesh = Mesh(vertices, jax.device_put(np.asarray(wall.faces, np.int32)), *others)
     step()
     try:
         geometry = Geometry.create(
@@ -195,8 +165,60 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     return Imported(
         mesh=mesh, geometry=geometry, rotation=cast(rotation), origin=cast(origin / scale),
         ring_errors=cast(found.errors), ring_shares=cast(found.shares), scale=scale,
-        notes=tuple(notes),
+        notes=(*notes, *found.notes),
     )  # fmt: skip
+
+
+class _File(NamedTuple):
+    """What a file holds, mm: the wall, cleaned; the cartilage, if it has any of its own."""
+
+    wall: Surface
+    cartilage: Surface | None
+    scale: float
+    notes: list[str]
+
+
+def _surfaces(path: Path, unit, part, rings, step) -> _File:
+    """Wall and cartilage among the objects of a file."""
+    parts = parts_of(path)
+    step()
+    surfaces, surface_of = joined(parts)
+    name = wall_of(surfaces, None if part is None else surface_of.get(part, part))
+    pieces = [piece for piece in parts if surface_of[piece] == name and piece != name]
+    notes = [f"wall: {', '.join([name, *pieces])}"] if len(parts) > 1 else []
+    own = rings_named(parts, name, rings)
+    of_rings = None if own is None else surface_of.get(own)
+    check_left_out(surfaces, name, of_rings, part is not None, notes)
+    surface, cleaned = clean(surfaces[name])
+    step()
+    scale = scale_of(surface, path, unit, notes)
+    cartilage = cartilage_of(parts, own, path, scale, notes)
+    return _File(Surface(surface.vertices * scale, surface.faces), cartilage, scale,
+                 [*notes, *cleaned])  # fmt: skip
+
+
+def _turned_up(line: Line, file: _File, larynx) -> Shape:
+    """The shape along the line from the carina to the larynx."""
+
+    def scan(line):
+        return Shape.scan(line, file.wall.vertices, file.wall.faces, file.cartilage)
+
+    if larynx is not None:
+        return scan(turned(line) if _points_back(line, larynx) else line)
+    shape = scan(line)
+    return scan(turned(line)) if _carina_is_last(shape) else shape
+
+
+def _in_tube_frame(shape: Shape, wall: Surface):
+    """Axes and origin of the tube frame in the file, and the arrays of a `Mesh` but its faces."""
+    line = shape.line
+    where = locate(line, wall.vertices)
+    rotation = _axes(line.points[-1] - line.points[0], line.frames[:, :, 1].mean(axis=0))
+    origin = line.points[0]
+    vertices = (wall.vertices - origin) @ rotation.T
+    normals = vertex_normals(vertices, wall.faces)
+    frames = rotation @ where.frames
+    return rotation, origin, (vertices, normals, where.s, where.phi, where.distance, frames)
 
 
 def _axes(along, anterior):
