@@ -22,7 +22,6 @@ from jaxtrachea.mechanics.force_law import coefficient
 from jaxtrachea.mechanics.levels.level import Closed, Motion
 from jaxtrachea.mechanics.press import Contact
 from jaxtrachea.mechanics.samples import no_history
-from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -295,27 +294,16 @@ class _Pressed(NamedTuple):
 def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion) -> _Pressed:
     """One press, given the skeleton at its place."""
     D, blend = motion.displacement, motion.blend
-    eye = jnp.eye(free.shape[0], dtype=free.dtype)
-
-    def at_contact(free):
-        return _at_contact(model, free, value, motion.s_c, tube)
+    count = free.shape[0]
 
     def push(t):
-        return jax.jvp(at_contact, (free,), (t,))
+        return jax.jvp(lambda f: _at_contact(model, f, value, motion.s_c, tube), (free,), (t,))
 
-    local, d_local = jax.vmap(push, out_axes=(None, 0))(eye)
+    local, d_local = jax.vmap(push, out_axes=(None, 0))(jnp.eye(count, dtype=free.dtype))
     contact, d_contact = local.contact._replace(blend=blend), d_local.contact
-    of_beam = _beam_columns(model)
-
-    def all_columns(v):
-        zero = jnp.zeros(v.shape[1:], v.dtype)
-        columns = [v[of_beam.index(i)] if i in of_beam else zero for i in range(len(eye))]
-        return jnp.stack(columns) if columns else v[:0]
-
-    d_skeleton = jax.tree.map(all_columns, by_beam)
-    c = _felt(model, skeleton)
+    c, d_skeleton = _felt(model, skeleton), _every_column(model, by_beam, count)
+    d_c = _felt(model, d_skeleton)
     solved = _closed(model).respond(D, c, contact)
-    of_force, of_load = sensitivity(solved, c, contact.law, contact.softening)
 
     def at(onset):
         return _closed(model).indentation(D, onset, blend)
@@ -324,21 +312,16 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
         return jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]
 
     by_onset = slope(contact.onset)
-    # Through what the free parameters act on the contact force: only these terms are computed.
-    moving = (p.name for p in model.free)
-    felt = {"compliance" if name in SKELETON else coefficient(name) or name for name in moving}
-    d_inputs = {"compliance": _felt(model, d_skeleton), "onset": d_contact.onset}
-    for record in (d_contact.law.coefficients(), _fields(d_contact.softening)):
-        d_inputs.update(record)
+    moved = _moved(model, d_c, d_contact)
 
     def pushed(by):
         by = by | {"onset": by["displacement"] * by_onset}
-        out = jnp.zeros((len(eye), *D.shape), D.dtype)
-        for name in d_inputs:
-            if name in felt:
-                out = out + d_inputs[name][:, None] * by[name][None]
+        out = jnp.zeros((count, *D.shape), D.dtype)
+        for name, change in moved.items():
+            out = out + change[:, None] * by[name][None]
         return out
 
+    of_force, of_load = sensitivity(solved, c, contact.law, contact.softening)
     d_force = pushed(of_force)
     load, d_load = solved.force, d_force
     if solved.load is not None:
@@ -347,28 +330,48 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
     if blend is not None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
         corner = of_force["displacement"] * curved * jnp.sum(d_contact.onset**2)
-    offset, d_offset = local.force_offset, d_local.force_offset[:, None]
-    if local.force_slope is not None:
-        offset = offset + local.force_slope * D
-        d_offset = d_offset + d_local.force_slope[:, None] * D[None]
     pressed = _Pressed(
-        force=solved.force,
-        d_force=d_force,
-        load=load,
-        d_load=d_load,
-        offset=offset,
-        d_offset=d_offset,
-        d_joints=d_skeleton.joints,
-        corner=corner,
-    )
+        solved.force, d_force, load, d_load, *_without_contact(local, d_local, D),
+        d_skeleton.joints, corner,
+    )  # fmt: skip
     if not _apart(model):
         return pressed
     # Where the elastic press has no solution, none has a history from then on.
     lost, _ = no_history(solved.status, jnp.zeros_like(D, bool))
-    moved = jnp.where(lost, jnp.nan, at(contact.onset))
-    d_moved = d_contact.onset[:, None] * by_onset[None]
-    way, d_way = Way(moved, c, contact), Way(d_moved, d_inputs["compliance"], d_contact)
+    way = Way(jnp.where(lost, jnp.nan, at(contact.onset)), c, contact)
+    d_way = Way(d_contact.onset[:, None] * by_onset[None], d_c, d_contact)
     return parts_press(model, free, value, motion.time, pressed, way, d_way)
+
+
+def _every_column(model: FitModel, by_beam: Skeleton, count: int) -> Skeleton:
+    """Derivatives by `_beam_columns` among those by all `count` free columns, 0 elsewhere."""
+    of_beam = _beam_columns(model)
+
+    def every(v):
+        zero = jnp.zeros(v.shape[1:], v.dtype)
+        columns = [v[of_beam.index(i)] if i in of_beam else zero for i in range(count)]
+        return jnp.stack(columns) if columns else v[:0]
+
+    return jax.tree.map(every, by_beam)
+
+
+def _moved(model: FitModel, d_compliance, d_contact: Contact) -> dict[str, Array]:
+    """By the free columns, (Jf,): that of what the contact force feels of any of them, by name."""
+    felt = {
+        "compliance" if p.name in SKELETON else coefficient(p.name) or p.name for p in model.free
+    }
+    softening = {} if d_contact.softening is None else d_contact.softening._asdict()
+    every = {"compliance": d_compliance, "onset": d_contact.onset}
+    every |= d_contact.law.coefficients() | softening
+    return {name: change for name, change in every.items() if name in felt}
+
+
+def _without_contact(local: _Local, d_local: _Local, D):
+    """The force without contact, and its derivatives."""
+    offset, d_offset = local.force_offset, d_local.force_offset[:, None]
+    if local.force_slope is None or d_local.force_slope is None:
+        return offset, d_offset
+    return offset + local.force_slope * D, d_offset + d_local.force_slope[:, None] * D[None]
 
 
 def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, trial: Lane):
@@ -423,7 +426,3 @@ def force_jacobian(
         assert motion.time is not None
         pressed = relaxed_press(model, free, value, motion.time, pressed)
     return pressed.d_force + pressed.d_offset
-
-
-def _fields(softening: Softening | None) -> dict[str, Array]:
-    return {} if softening is None else softening._asdict()
