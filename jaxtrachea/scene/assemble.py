@@ -88,21 +88,16 @@ def make_scene(
     check_material(geometry, material)
     check_word("mesh", mesh, Mesh | None)
     check_word("effects", effects, EffectOptions)
-    moves = isinstance(next(iter(paths.values())), Poses)
     dtype = geometry.length.dtype
     shapes = {n: jax.tree.map(lambda v: jnp.asarray(v, dtype), t.shape) for n, t in tools.items()}
-    kind = level_type(material)
-    own, sections = kind.thickness(long_run(material)), not kind.hangs_on_rings
-    if radius is None and own is not None:
-        outer = geometry.radius + own / 2
-    else:
-        outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
-    tube = None
+    sections = not level_type(material).hangs_on_rings
+    outer = _outside(geometry, material, mesh) if radius is None else jnp.asarray(radius, dtype)
     for shape in shapes.values():
         check_sizes(geometry, float(outer), shape)
-        if moves and shape is None:
+    tube = None
+    if isinstance(next(iter(paths.values())), Poses):
+        if None in shapes.values():
             raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
-    if moves:
         if mesh is None or (sections and mesh.frames is None):
             tube = round_wall(geometry, float(outer))
         else:
@@ -224,8 +219,14 @@ def _footprint(tool: Shape | None, outer: float) -> float:
     return max(FOOTPRINT * extent, least)
 
 
-def _outer(geometry: Geometry, mesh: Mesh | None):
-    """Radius of the outside, mm: of an imported mesh read with it, of a made one its crests."""
+def _outside(geometry: Geometry, material: AnyMaterial, mesh: Mesh | None):
+    """Radius of the outside, mm: half of the wall's thickness beyond its mid-line, if it has one.
+
+    Else of an imported mesh that read with it, of a made one that of its crests.
+    """
+    thickness = level_type(material).thickness(long_run(material))
+    if thickness is not None:
+        return geometry.radius + thickness / 2
     if mesh is None:
         return geometry.radius + (OUTER - RADIUS) * (geometry.radius / RADIUS)
     return geometry.radius if mesh.frames is not None else jnp.asarray(np.max(mesh.distance))

@@ -129,11 +129,11 @@ def press_together(
         samples, back = samples_of(material.relaxation, before, together, refused)
         refused[PressStatus.BACK_IN_TIME] = back
     hidden = functools.reduce(jnp.logical_or, refused.values())
-    presses, used = [p for p, *_ in found], [u for _, u, *_ in found]
+    used = [u for _, u, *_ in found]
     s, phi = jnp.stack([p.s[0] for p in used]), jnp.stack([p.phi[0] for p in used])
     if scene.plan.friction:
         if rubbed is None:
-            rubbed = rub_paths(scene, safe, s, phi, presses, hidden, made)
+            rubbed = rub_paths(scene, safe, s, phi, [p for p, *_ in found], hidden, made)
         lost = jnp.isnan(jnp.sum(rubbed.slid.force, axis=(1, 2)))
         slid, hidden = without_steps(rubbed.slid, lost), hidden | lost
         solved = _Solved(rubbed.unit, slid.depth, slid.force, slid.force, slid.status)
@@ -157,18 +157,30 @@ def press_together(
         lost = ~jnp.isfinite(jnp.sum(vectors["force"] + vectors["moment"], axis=2))
         status = jnp.where((status == PressStatus.OK) & lost, PressStatus.NON_FINITE, status)
     fields = mask_rows(hidden, vectors | rings)
+    return (
+        fields | _of_each(each, paths, made, found, fields, status, refused),
+        moved,
+        solved.history,
+    )
+
+
+def _of_each(
+    each: list[Scene], paths: Sequence[Poses | Presses], made: Sequence[Approach | None],
+    found: list, fields: dict[str, Any], status: Int[Array, "rows m"], refused: dict,
+) -> dict[str, Any]:  # fmt: skip
+    """Fields of a `Simulation` that each tool has for itself, and the statuses."""
+    presses, comes = [p for p, *_ in found], [m for m in made if m is not None]
+    touches = [m.own for m in comes]
     share = [
         depth_share(v, fields["depth"][:, j], fields["skeleton"][:, j], found[j][2])
         for j, v in enumerate(each)
     ]
     word = [status_of(status[:, j], share[j], made[j], refused) for j in range(len(each))]
-    comes = [m for m in made if m is not None]
-    touches = [m.own for m in comes]
 
     def stack(values):
         return jnp.stack(values, axis=1) if values else None
 
-    return fields | {
+    return {
         "s": stack([p.s for p in presses]), "phi": stack([p.phi for p in presses]),
         "gap": stack([touch.gap for touch in touches]),
         "displacement": stack([p.displacement for p in presses]),
@@ -176,7 +188,7 @@ def press_together(
         "depth_share": stack(share),
         "contact_share": stack([contact_share(*v) for v in zip(each, touches, strict=False)]),
         "status": _in_space(each, paths, stack(word)),
-    }, moved, solved.history  # fmt: skip
+    }  # fmt: skip
 
 
 def _reached_beyond(
