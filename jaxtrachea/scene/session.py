@@ -197,9 +197,10 @@ class Session:
         if self._timed:
             if dt is None:
                 raise ValueError(NO_TIME)
-            if not isinstance(dt, float) and (np.ndim(dt) or isinstance(dt, str)):
+            took = np.asarray(dt)
+            if took.ndim or took.dtype.kind not in "iuf":
                 raise ValueError(f"dt is {dt!r}; expected one number, s, as in 0.001")
-            pose += (np.asarray(dt, self.dtype),)
+            pose += (took.astype(self.dtype),)
         return self._run(begin, pose)
 
     def _checked_pose(self, rotation, translation, of: str = "") -> tuple[np.ndarray, np.ndarray]:
