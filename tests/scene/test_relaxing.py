@@ -202,7 +202,7 @@ def test_a_session_is_the_scan():
         row = session.step(*given)
         np.testing.assert_allclose(row.force, found.force[i], atol=1e-12)
         assert row.status == found.status[i]
-    for dt in ("1 s", np.zeros(2), True, 1j):
+    for dt in ("1 s", np.zeros(2), np.array(True), 1j):
         with pytest.raises(ValueError, match="dt is .* expected one number, s"):
             session.step(*given[:2], dt)
     again = pickle.loads(pickle.dumps(session))
