@@ -251,6 +251,12 @@ def test_only_the_page_itself_is_answered(server):
     assert server.get("/_nicegui/3.18.0/static/..%2f..%2fapp.py", Cookie=cookie)[0] == 404
 
 
+def test_a_browser_is_opened_once_the_page_answers(server):
+    """The web server starts what it calls at its start before it listens."""
+    wait_until(lambda: any("page" in line for line in server.lines), 30)
+    assert "page found\n" in server.lines
+
+
 def test_it_listens_on_loopback_alone(server):
     rows = Path("/proc/net/tcp").read_text().split("\n") if sys.platform == "linux" else []
     found = [r.split()[1] for r in rows[1:] if r and r.split()[3] == "0A"]

@@ -1,6 +1,9 @@
 """A page on 127.0.0.1: its server, and the line that says where its work stands."""
 
 import secrets
+import socket
+import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -77,8 +80,13 @@ def serve(
     app.add_middleware(Guard, port=port, token=token)
     ui.page("/", title=f"{title} - jaxtrachea")(lambda: page(worker).build())
 
-    def started() -> None:
+    def tell() -> None:
+        while not _answers(port):
+            time.sleep(0.01)
         opened(f"http://127.0.0.1:{port}/?token={token}")
+
+    def started() -> None:  # the server listens only after it
+        threading.Thread(target=tell, name="address", daemon=True).start()
         worker.start()
 
     app.on_startup(started)
@@ -88,3 +96,12 @@ def serve(
         show_welcome_message=False, gzip_middleware_factory=None, ws_max_size=2**16,
         reconnect_timeout=30,  # a page that draws slowly is not a page that has gone
     )  # fmt: skip
+
+
+def _answers(port: int) -> bool:
+    """Whether a server listens."""
+    try:
+        socket.create_connection(("127.0.0.1", port), timeout=1).close()
+    except OSError:
+        return False
+    return True
