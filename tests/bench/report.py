@@ -4,7 +4,7 @@ import statistics
 
 from page import FOLDER, microseconds, number, quoted, ratio, read, table, verdict
 from report_growth import against_section, commands_section, gradient_section, growth_section
-from report_peers import peers_section
+from report_peers import identification_section, peers_section
 
 SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup", "peers", "growth",
           "gradient", "against")  # fmt: skip
@@ -262,6 +262,7 @@ def document() -> str:
     parts = [
         "## Peers\n",
         peers_section(*suites["peers"]),
+        identification_section(*read("identification")),
         skeleton_section(suites["skeleton"][1], goals),
         growth_section(suites["growth"][1], goals),
         gradient_section(suites["gradient"][1], goals),

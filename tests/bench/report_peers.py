@@ -1,8 +1,8 @@
-"""The section of docs/evidence/benchmarks.md on other programs, from results/peers.jsonl."""
+"""The sections of docs/evidence/benchmarks.md on other programs, from peers and identification."""
 
 import statistics
 
-from page import number, table
+from page import microseconds, number, table
 
 OURS = "jaxtrachea"
 
@@ -53,6 +53,26 @@ def peers_section(environment: dict, rows: list[dict]) -> str:
     return "\n".join([PEERS + measured, table(head, lines), *notes])
 
 
+def identification_section(environment: dict, rows: list[dict]) -> str:
+    """Presses and fits by MuJoCo beside ours: processor time, ratio to ours."""
+    lines = []
+    for what in ("press", "fit"):
+        here = {r["case"]: r for r in rows if r["table"] == what}
+        ours, *_ = microseconds(here[OURS])
+        for case, r in here.items():
+            spent, *_ = microseconds(r)
+            told = [number(spent / 1e3), number(spent / ours)]
+            told.append("-" if case == OURS else f"{r['differs']:.1e}")
+            lines.append([what, case, *told])
+    head = ["", "program", "processor ms", "over ours", "differs by"]
+    where = (
+        f"Measured {environment['date']} at commit {environment['commit']} on one core of a "
+        f"{environment['cores_of_machine']}-core {environment['cpu']}, MuJoCo "
+        f"{environment['versions']['mujoco']}.\n"
+    )
+    return "\n".join(["### Identification by MuJoCo\n", IDENTIFICATION, where, table(head, lines)])
+
+
 PEERS = """\
 `python tests/bench/peers.py`, by pytest-benchmark in one run: the cases of a group one after the
 other, and this in turns. The last column is the median over the turns of the peer's median time
@@ -70,4 +90,23 @@ problem. coal is called from Python for each of 16 capsules and gives no derivat
 two of 16 patches and smooths the gap to be differentiable. Ours fits 500 specimens in one batch,
 the solvers 10 one after the other; estimates differ by that part of a standard error.
 
+"""
+IDENTIFICATION = """\
+`python tests/bench/identification.py`: EI_L, k_M, k_1, k_3 of one specimen from ten positions × 50
+points with 0.5 % noise, start (10, 0.1, 1, 0.01), and these ten curves pressed once. MuJoCo 4 has
+no beam on springs; it is made of its joints, tendons (with a cubic spring for the local law) and a
+servo, and is exact for forces at nodes. Its steps of 1 s with the integrator `discrete` are Newton
+steps to rest, eight at each depth. `mujoco.batch` presses the ten positions together;
+`mujoco.sysid.optimize` differentiates by differences, by its own solver or SciPy's. Ours fits
+500 specimens in one batch, with standard errors; the others two, one after the other. A press
+differs relative to the largest force (the servo, 1e4 N/mm, is in series with MuJoCo's contact), an
+estimate in standard errors.
+
+What MuJoCo does better: contact, friction, several bodies and motion in time come with the same
+model, without a rule which of them are solved together; a run of one batch has the same bits at any
+number of threads; a model is read from a file that other programs read; `sysid` takes any sensor
+and any parameter that can be written into the model, fits several models at once, and writes a
+report. Nothing is compiled: the first answer comes at once. What it lacks here: derivatives of a
+press, statics (a step that does not come to rest gives a force, not a status), a noise of each
+curve, and verdicts on what the curves do not tell.
 """
