@@ -239,7 +239,7 @@ def _solve_path_jvp(primals, tangents):
     way = jnp.zeros_like(displacement) if still else tangents[1]
 
     # One by one: each of its parts is a kernel then.
-    tangent = one_by_one(lambda *at: _system.linearise(*at, system)[1], found.state, displacement)
+    tangent = one_by_one(lambda z, D: _system.linearise(z, D, system)[1], found.state, displacement)
 
     def one(state, D, D_grown, tangent):
         def off(D, moved):
