@@ -1,8 +1,9 @@
 """Model minus data of a lane whose level has no closed form: `Level.response`, trial by trial.
 
-Every trial is pressed along its own path. The Jacobian is that of the equilibria by the free
-columns, in forward mode: one path for all columns. A sample without equilibrium is NaN, which makes
-the cost infinite wherever that sample is observed.
+Every trial is pressed along its own path, on a CPU one after the other: called alone, parts of a
+step are a kernel each, and no path waits for a longer one. The Jacobian is that of the equilibria
+by the free columns, in forward mode: one path for all columns. A sample without equilibrium is NaN,
+which makes the cost infinite wherever that sample is observed.
 """
 
 import jax
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.lane import Lane, forces, markers, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
+from jaxtrachea.fusion import one_by_one
 from jaxtrachea.mechanics.levels.level import Motion, Response
 from jaxtrachea.mechanics.validation import has_solution
 from jaxtrachea.trachea.geometry import Geometry
@@ -59,7 +61,7 @@ def residual(
         seen, slopes = jax.vmap(push, out_axes=(None, 0))(eye)
         return _row(seen, trial), jax.vmap(lambda slope: _whitened(slope, trial))(slopes)
 
-    return jax.vmap(one)(free, trials)
+    return one_by_one(one, free, trials)
 
 
 def residual_value(
@@ -70,7 +72,7 @@ def residual_value(
     def one(free, trial):
         return _row(_seen(model, free, trial, tube), trial)
 
-    return jax.vmap(one)(free, trials)
+    return one_by_one(one, free, trials)
 
 
 def force_jacobian(

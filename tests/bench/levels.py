@@ -11,7 +11,6 @@ docs/evidence/tradeoff.md.
 
 import common  # isort: skip
 
-import dataclasses
 import functools
 import sys
 import time
@@ -26,7 +25,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
-from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial, from_wall
 from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry, table_1
@@ -109,7 +108,7 @@ def section_study(phi: float, specimens: int):
     """Specimens of deforming sections, three presses at one angle; EI_C and bed_n are fitted."""
     rng = np.random.default_rng(5)
     given = from_wall(SHORT)
-    wall = {f.name: np.median(getattr(given, f.name)) for f in dataclasses.fields(given)}
+    wall = {name: np.median(getattr(given, name)) for name in SECTION_VALUES}
     names = ("EI_C", "bed_n")
     truth = np.array([wall[n] for n in names]) * np.exp(0.1 * rng.standard_normal((specimens, 2)))
     places = (8.0, 15.0, 19.0)

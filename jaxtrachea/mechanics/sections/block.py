@@ -5,16 +5,13 @@ pivots are exchanged: for positive definite matrices none need be, and of others
 pivots are wanted (Sylvester: as many negative as eigenvalues).
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
-#: Largest matrix that `invert` eliminates entry by entry: a node of the midline.
-LEAF = 7
+from jaxtrachea.fusion import fuse
 
 
 class Factors(NamedTuple):
@@ -36,66 +33,26 @@ class Factors(NamedTuple):
     negative: Int[Array, ""]
 
 
-def invert(
-    matrix: Float[Array, "m m"], *, symmetric: bool = False
-) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
-    """Inverse without exchange of pivots, and the number of negative ones.
+def invert(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
+    """Inverse by Gauss-Jordan without exchange of pivots, and the number of negative ones.
 
-    By halves down to `LEAF`: products of matrices are quicker than the elimination of a large one.
-    What an inverse of the first half gives has errors of its condition number times those of an
-    elimination; one correction by the residual takes them off again. Without it the pivots of the
-    second half lose the square of the condition number, and with them their signs.
+    Each pivot is the first entry; its row and column then go behind all others, so that after m of
+    them all are in their places. A loop: its body is vectorised, and compiled once.
 
     Args:
         matrix: no leading part of it is singular.
-        symmetric: it is its own transpose up to rounding, and so is the inverse.
     """
-    m = matrix.shape[0]
-    if m <= LEAF:
-        return _eliminate(matrix)
-    k = (m + 1) // 2
-    upper, right, left = matrix[:k, :k], matrix[:k, k:], matrix[k:, :k]
-    first, negative = invert(upper, symmetric=symmetric)
-    gain = first @ right
-    gain = gain + first @ (right - upper @ gain)
-    rows = gain.T if symmetric else left @ first
-    last, more = invert(matrix[k:, k:] - left @ gain, symmetric=symmetric)
-    side = gain @ last
-    below = side.T if symmetric else last @ rows
-    return jnp.block([[first + side @ rows, -side], [-below, last]]), negative + more
 
+    def eliminate(carry, _):
+        A, negative = carry
+        pivot, column = A[0, 0], A[1:, 0]
+        row = A[0, 1:] / pivot
+        rest = A[1:, 1:] - column[:, None] * row[None]
+        A = jnp.block([[rest, -(column / pivot)[:, None]], [row[None], 1 / pivot[None, None]]])
+        return (A, negative + (pivot < 0).astype(jnp.int32)), None
 
-def _eliminate(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
-    """`invert` by Gauss-Jordan.
-
-    Two pivots at a time, so that half as many operations wait for each other. The second is what
-    the first leaves of it: the closed inverse of the 2 x 2 block, by its determinant, would lose
-    the square of its condition number.
-    """
-    m = matrix.shape[0]
-    A, pivots, places = matrix, [], np.arange(m)
-    for k in range(0, m - 1, 2):
-        a, b, c, d = A[k, k], A[k, k + 1], A[k + 1, k], A[k + 1, k + 1]
-        one_over, share = 1 / a, c / a
-        pivot = d - share * b
-        pivots += [a, pivot]
-        one, two = places == k, places == k + 1
-        row = jnp.where(one, 1, jnp.where(two, 0, A[k]))
-        other = jnp.where(two, 1, jnp.where(one, 0, A[k + 1]))
-        second = (other - share * row) * (1 / pivot)
-        first = (row - b * second) * one_over
-        rest = jnp.where((one | two)[None], 0, A)
-        rest = rest - A[:, k, None] * first[None] - A[:, k + 1, None] * second[None]
-        A = jnp.where(one[:, None], first[None], jnp.where(two[:, None], second[None], rest))
-        # XLA would compute every step again for each element of the next.
-        A = jax.lax.optimization_barrier(A)
-    if m % 2:
-        p, last = A[-1, -1], places == m - 1
-        pivots.append(p)
-        row = jnp.where(last, 1, A[-1]) / p
-        rest = jnp.where(last[None], 0, A) - A[:, -1, None] * row[None]
-        A = jnp.where(last[:, None], row[None], rest)
-    return A, jnp.sum((jnp.stack(pivots) < 0).astype(jnp.int32))
+    begin = matrix, jnp.zeros((), jnp.int32)
+    return jax.lax.scan(eliminate, begin, length=matrix.shape[0])[0]
 
 
 def _chains(nodes, fill):
@@ -122,15 +79,17 @@ def factor(diagonal: Float[Array, "n m m"], upper: Float[Array, "n m m"]) -> Fac
         lower = jnp.concatenate([jnp.zeros_like(eye)[None], lower])
     U = jnp.stack([upper[:half], lower], 1)
 
+    both = fuse(jax.vmap(invert))
+
     def step(carry, blocks):
         D, U = blocks
-        inverse, negative = jax.vmap(functools.partial(invert, symmetric=True))(D - carry)
+        inverse, negative = both(D - carry)
         gain = inverse @ U
         return U.transpose(0, 2, 1) @ gain, (inverse, gain, negative)
 
     carry, (inverse, gain, negative) = jax.lax.scan(step, jnp.zeros_like(D[0]), (D, U))
-    middle, own = invert(centre - carry[0] - carry[1], symmetric=True)
-    return Factors(inverse, gain, middle, jnp.sum(negative) + own)
+    middle, own = fuse(invert)(centre - carry[0] - carry[1])
+    return Factors(inverse, gain, middle, jnp.sum(negative, dtype=jnp.int32) + own)
 
 
 def solve(factors: Factors, rhs: Float[Array, "n m k"]) -> Float[Array, "n m k"]:

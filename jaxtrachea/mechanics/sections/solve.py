@@ -6,15 +6,18 @@ displacement, which the tangent gives with the step), corrected further, or give
 again from the last state with half the substep). Lanes of a `vmap` go each their way.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._linear import replaced
 from jaxtrachea._numerics import epsilon, full_precision
-from jaxtrachea.fusion import fuse
+from jaxtrachea.fusion import fuse, one_by_one
 from jaxtrachea.mechanics.sections import system as _system
 from jaxtrachea.mechanics.sections.system import State, System
 
@@ -110,13 +113,7 @@ def _size(step, system: System):
 
 def _newton(z, displacement, system: System):
     """Newton's step from z, the derivative of the solution by the displacement, and stability."""
-    state = _state(z, system)
-    close = fuse(_system.lines, products=True)
-    found = _system.elements(close(state, system), state, system)
-    assemble = _system.assemble
-    if system.grid.midline:  # With blocks of 14 x 14 the library is quicker.
-        assemble = fuse(assemble, products=True)
-    r, tangent = assemble(found, state, displacement, system)
+    r, tangent = _system.linearise(_state(z, system), displacement, system)
     along = jax.tree.map(jnp.zeros_like, r)._replace(
         force=jnp.broadcast_to(system.direction, r.force.shape)
     )
@@ -229,20 +226,28 @@ def solve_path(system: System, displacement: Float[Array, " m"]) -> Solved:
     return _follow(system, displacement)
 
 
-@solve_path.defjvp
+@functools.partial(solve_path.defjvp, symbolic_zeros=True)
 @full_precision
 def _solve_path_jvp(primals, tangents):
     system, displacement = primals
     found = solve_path(system, displacement)
+    values, tree = jax.tree.flatten(system)
+    grown = jax.tree.leaves(tangents[0])
+    moving = [i for i, v in enumerate(grown) if not isinstance(v, SymbolicZero)]
+    given = [values[i] for i in moving], [grown[i] for i in moving]
+    still = isinstance(tangents[1], SymbolicZero)
+    way = jnp.zeros_like(displacement) if still else tangents[1]
 
-    def one(state, D, D_grown):
-        def off(D, system):
-            return _system.residual(state, D, system)
+    # One by one: each of its parts is a kernel then.
+    tangent = one_by_one(lambda z, D: _system.linearise(z, D, system)[1], found.state, displacement)
 
-        _, grown = jax.jvp(off, (D, system), (D_grown, tangents[0]))
-        _, tangent = _system.linearise(state, D, system)
+    def one(state, D, D_grown, tangent):
+        def off(D, moved):
+            return _system.residual(state, D, tree.unflatten(replaced(values, moving, moved)))
+
+        _, grown = jax.jvp(off, (D, given[0]), (D_grown, given[1]))
         return jax.tree.map(jnp.negative, _system.solve_linear(tangent, grown))
 
-    grown = jax.vmap(one)(found.state, displacement, tangents[1])
+    grown = jax.vmap(one)(found.state, displacement, way, tangent)
     none = jnp.zeros_like(found.solved)
     return found, Solved(grown, none, none, none)
