@@ -106,6 +106,11 @@ def on_one_point(
     """The path as presses on the place that the tool touches first, at or before row `first`."""
     rows, place = seen.gap.shape[0], landing(scene, path, seen, first)
     D, inward = place.way, local_frame(place.phi)[0]
+    if scene.plan.options.contact != "bonded":
+        # A round wall falls away from the tangent plane at its first place: what is clear of it
+        # does not press, though its way may lead below that plane.
+        below = jnp.maximum(product_of_rows(D, inward) + seen.gap, 0)
+        D = D - jnp.where(seen.gap > 0, below, 0)[:, None] * inward[None]
     if scene.plan.friction or scene.plan.options.contact == "bonded":
         # What goes on from row to row begins at first touch, where the way is 0. A pose that is no
         # number stays none.

@@ -207,9 +207,12 @@ def _no_history(case: Case) -> tuple[str, str] | None:
             f"give each [[path]] a duration, or its file a column t, {or_off}",
         )
     if case.levels["contact_point"] != "fixed":
+        shorter = "shorten the path or set contact_point 'fixed'"
+        if not case.facts.poses:
+            shorter = "simulate the presses of each place by themselves"
         return (
             "the contact does not keep its place, and each place has a history of its own",
-            f"shorten the path or set contact_point 'fixed', {or_off}",
+            f"{shorter}, {or_off}",
         )
     if case.levels["friction"] == "on":
         return (

@@ -70,7 +70,7 @@ def facts_of(
     here = np.broadcast_to(place[1], s.shape)
     inward = -(moved[:, 1] * np.cos(here) + moved[:, 2] * np.sin(here))
     # Rows that press one place, and those that press each its own; not what goes before.
-    held = touching | (outside & ((moved != 0).any(axis=1) if bonded else inward > 0))
+    held = touching | (outside & (moved != 0).any(axis=1)) if bonded else touching
     own = outside if bonded else touching
     near = held | (several & outside & (gap < RAISED * float(scene.radius)))
     motion = motion_of(s[held], here[held], moved[held], np)

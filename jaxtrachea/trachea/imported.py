@@ -130,6 +130,7 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
 
     file = _surfaces(path, unit, part, rings, step)
     wall, cartilage, scale, notes = file
+    notes = list(notes)
     given = None if known.centreline is None else np.asarray(known.centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
     check_turn(line)
@@ -175,7 +176,7 @@ class _File(NamedTuple):
     wall: Surface
     cartilage: Surface | None
     scale: float
-    notes: list[str]
+    notes: tuple[str, ...]
 
 
 def _surfaces(path: Path, unit, part, rings, step) -> _File:
@@ -194,7 +195,7 @@ def _surfaces(path: Path, unit, part, rings, step) -> _File:
     scale = scale_of(surface, path, unit, notes)
     cartilage = cartilage_of(parts, own, path, scale, notes)
     return _File(Surface(surface.vertices * scale, surface.faces), cartilage, scale,
-                 [*notes, *cleaned])  # fmt: skip
+                 (*notes, *cleaned))  # fmt: skip
 
 
 def _turned_up(line: Line, file: _File, larynx) -> Shape:

@@ -9,7 +9,7 @@ from small_scenes import BALL, BARE, MATERIAL, MESH, SPRINGS, TUBE, ball, presse
 
 from jaxtrachea import EffectOptions, PlanError, Poses, make_scene, simulate
 from jaxtrachea.scene import facts as scene_facts
-from jaxtrachea.scene.declare import SceneFacts
+from jaxtrachea.scene.declare import RELAXES, SceneFacts
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.stage import Tool
 
@@ -142,3 +142,10 @@ def test_an_array_that_its_owner_changes_later_leaves_the_path():
         own += 1.0
         assert not np.asarray(path.translation).any()
         own -= 1.0
+
+
+def test_presses_at_several_places_are_told_a_cure_that_works():
+    """`fixed` would be refused for them."""
+    facts = SceneFacts(several_points=True, timed=True, known=frozenset({RELAXES}))
+    with pytest.raises(PlanError, match="simulate the presses of each place by themselves"):
+        make_plan(facts, EffectOptions())

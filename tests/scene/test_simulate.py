@@ -29,6 +29,7 @@ from jaxtrachea import (
     Poses,
     Presses,
     make_scene,
+    press,
     press_oblique,
     simulate,
     sweep,
@@ -211,6 +212,30 @@ def test_the_place_of_first_touch_does_not_follow_the_step():
         assert abs(out.phi[-1] - fine.phi[-1]) * OUTER < at
         off = np.linalg.norm(np.asarray(out.force[-1]) - known)
         assert off < share * np.linalg.norm(known)
+
+
+@pytest.mark.parametrize("mu", [None, pytest.param(0.5, marks=pytest.mark.long)])
+def test_what_is_clear_of_a_round_wall_does_not_press(mu):
+    """The tangent plane at the place of first touch lies above a round wall beside it.
+
+    A ball glides round the tube 0.2 mm clear of it, presses, lifts off and glides on: it touches
+    where its middle is nearer to the axis than both radii.
+    """
+    aside = np.linspace(-4, 0, 6) / (OUTER + 5.2)
+    height = np.r_[np.full(5, 5.2), 5.2, 4.4, 3.4, 5.2, np.full(5, 5.2)]
+    angle = np.r_[aside[:-1], 0, 0, 0, 0, -aside[-2::-1]]
+    r = OUTER + height
+    places = np.stack([0 * r + 75, r * np.cos(angle), r * np.sin(angle)], axis=1)
+    path = Poses(np.broadcast_to(np.eye(3), (len(r), 3, 3)), places)
+    scene = make_scene(TUBE, SPRINGS, path, tool=Tool(BALL, mu), effects=BARE)
+    assert scene.plan.contact_point == "fixed"
+    out = jax.device_get(run(scene, SPRINGS, path))
+    touches = height < 5
+    np.testing.assert_array_equal(out.status == PressStatus.OK, touches)
+    np.testing.assert_array_equal(out.status == PressStatus.NO_CONTACT, ~touches)
+    np.testing.assert_array_equal(out.force[~touches], 0)
+    alone = press(TUBE, SPRINGS, 75.0, -out.gap[touches])
+    np.testing.assert_allclose(-out.force[touches, 1], alone.force, rtol=1e-5)
 
 
 @pytest.mark.slow

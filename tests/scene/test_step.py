@@ -91,7 +91,7 @@ def scan(rubbed):
 
 
 def test_a_scan_is_the_session(rubbed, scan):
-    """To rounding here, where compilers do not optimise; to the bit in the slow test."""
+    """Here compilers do not optimise; they do in the slow test."""
     scene, material, session = rubbed
     way = [np.split(np.asarray(v), 10) for v in way_of(300)]
     session.reset()
@@ -104,11 +104,12 @@ def test_a_scan_is_the_session(rubbed, scan):
 
 
 @pytest.mark.slow
-def test_a_scan_is_the_session_to_the_bit():
+def test_a_long_scan_is_the_session():
+    """To the bit on some processors; on others the two programs round apart from some step on."""
     scene, material = made(RUBBED, material=MATERIAL)
     way = way_of(5000)
     found = scanned(scene, material)(jt.init_state(scene, material), *way)[1]
-    same(found, stepped(jt.Session(scene, material), *way))
+    same(found, stepped(jt.Session(scene, material), *way), 1e-11)
 
 
 @pytest.mark.slow

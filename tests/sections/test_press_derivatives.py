@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.sections.press import SectionOptions, press_sections
 from jaxtrachea.trachea.geometry import Geometry
 
 from .test_press import VALUES
@@ -66,3 +66,27 @@ def test_reverse_is_forward():
     back = jax.jit(lambda x, w: jax.vjp(force, x)[1](w)[0])  # of one result
     reverse = np.stack([back(FLAT, w)[USED] for w in jnp.eye(3)])
     np.testing.assert_allclose(reverse, forward(), atol=1e-9 * np.abs(forward()).max())
+
+
+def of_two(x):
+    """Of bending and of the contact's cubic stiffness, on the midline of two rings."""
+    material = SectionMaterial(**VALUES | {"EI_C": x[0], "c_n": x[1]})
+    tube, path = Geometry.create(25.0, [8.0, 17.0], radius=11.7), jnp.asarray([1.0, 3.0])
+    got = press_sections(tube, material, 12.0, 0.0, path, options=SectionOptions(midline=True))
+    return jnp.sum(jnp.sin(got.force[:, 1]))
+
+
+@pytest.mark.long
+def test_second_derivatives_in_any_order_of_modes_are_traced():
+    at = jnp.asarray([VALUES["EI_C"], VALUES["c_n"]])
+    for twice in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
+        assert jax.eval_shape(twice(of_two), at).shape == (2, 2)
+
+
+@pytest.mark.slow
+def test_second_derivatives_are_differences_of_the_first():
+    at = jnp.asarray([VALUES["EI_C"], VALUES["c_n"]])
+    slope, h = jax.jit(jax.grad(of_two)), 1e-4 * at
+    steps = [(slope(at + v) - slope(at - v)) / (2 * jnp.sum(v)) for v in jnp.diag(h)]
+    found, scale = jax.jit(jax.hessian(of_two))(at), jnp.outer(at, at)
+    np.testing.assert_allclose(found * scale, jnp.stack(steps) * scale, rtol=1e-5, atol=1e-7)

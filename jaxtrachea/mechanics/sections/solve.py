@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._linear import replaced
 from jaxtrachea._numerics import epsilon, full_precision
-from jaxtrachea.fusion import fuse, one_by_one
+from jaxtrachea.fusion import fuse
 from jaxtrachea.mechanics.sections import system as _system
 from jaxtrachea.mechanics.sections.system import State, System
 
@@ -238,8 +238,7 @@ def _solve_path_jvp(primals, tangents):
     still = isinstance(tangents[1], SymbolicZero)
     way = jnp.zeros_like(displacement) if still else tangents[1]
 
-    # One by one: each of its parts is a kernel then.
-    tangent = one_by_one(lambda z, D: _system.linearise(z, D, system)[1], found.state, displacement)
+    tangent = jax.vmap(lambda z, D: _system.linearise(z, D, system)[1])(found.state, displacement)
 
     def one(state, D, D_grown, tangent):
         def off(D, moved):
