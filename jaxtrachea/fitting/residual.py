@@ -312,12 +312,12 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
         return jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]
 
     by_onset = slope(contact.onset)
-    moved = _moved(model, d_c, d_contact)
+    d_inputs = _input_derivatives(model, d_c, d_contact)
 
     def pushed(by):
         by = by | {"onset": by["displacement"] * by_onset}
         out = jnp.zeros((count, *D.shape), D.dtype)
-        for name, change in moved.items():
+        for name, change in d_inputs.items():
             out = out + change[:, None] * by[name][None]
         return out
 
@@ -330,9 +330,10 @@ def _press(model: FitModel, tube, free, value, skeleton, by_beam, motion: Motion
     if blend is not None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
         corner = of_force["displacement"] * curved * jnp.sum(d_contact.onset**2)
+    offset, d_offset = _without_contact(local, d_local, D)
     pressed = _Pressed(
-        solved.force, d_force, load, d_load, *_without_contact(local, d_local, D),
-        d_skeleton.joints, corner,
+        force=solved.force, d_force=d_force, load=load, d_load=d_load, offset=offset,
+        d_offset=d_offset, d_joints=d_skeleton.joints, corner=corner,
     )  # fmt: skip
     if not _apart(model):
         return pressed
@@ -355,8 +356,8 @@ def _every_column(model: FitModel, by_beam: Skeleton, count: int) -> Skeleton:
     return jax.tree.map(every, by_beam)
 
 
-def _moved(model: FitModel, d_compliance, d_contact: Contact) -> dict[str, Array]:
-    """By the free columns, (Jf,): that of what the contact force feels of any of them, by name."""
+def _input_derivatives(model: FitModel, d_compliance, d_contact: Contact) -> dict[str, Array]:
+    """Derivatives, (Jf,), of what the contact force depends on, by name; none that are 0."""
     felt = {
         "compliance" if p.name in SKELETON else coefficient(p.name) or p.name for p in model.free
     }

@@ -96,7 +96,7 @@ def make_scene(
         check_sizes(geometry, float(outer), shape)
     tube = None
     if isinstance(next(iter(paths.values())), Poses):
-        if None in shapes.values():
+        if any(shape is None for shape in shapes.values()):
             raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
         if mesh is None or (sections and mesh.frames is None):
             tube = round_wall(geometry, float(outer))

@@ -9,10 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea.files.traces import Traced
 from jaxtrachea.mechanics.levels.choose import AnyMaterial, level_type
 from jaxtrachea.mechanics.levels.relaxing import long_run
-from jaxtrachea.scene.approach import first_touch
+from jaxtrachea.scene.approach import first_touch, on_one_point
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.effects import EffectOptions, given_values
-from jaxtrachea.scene.landing import landing
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.needs import (
     PLANNED,
@@ -54,7 +53,7 @@ def facts_of(
     """
     curved = scene.mesh is not None and scene.mesh.frames is not None
     if isinstance(path, Poses):
-        seen = _TOUCHED(_what_is_touched(scene, curved), _filled_up(path))
+        seen = _TOUCHED(_what_is_touched(scene, curved, bonded), _filled_up(path))
         rows = len(path.translation)
         s, phi, touching, moved = (np.asarray(v)[:rows] for v in seen[:4])
         s, phi, moved = (np.asarray(v, float) for v in (s, phi, moved))
@@ -62,7 +61,6 @@ def facts_of(
         gap = np.asarray(seen[5], float)[:rows]
         outside = touching | ~(gap < 0)
         after = outside & (np.arange(rows) >= int(seen[4]))
-        moved = np.where(after[:, None], moved, 0) if bonded else moved
     else:
         s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
         touching, place = np.ones(len(s), bool), np.array([s, phi])
@@ -148,9 +146,10 @@ def _softness(material: AnyMaterial, radius: float) -> tuple[float, float]:
     return float(e_1) * radius, float(e_2) * radius**2
 
 
-def _what_is_touched(scene: Scene, curved: bool) -> Scene:
+def _what_is_touched(scene: Scene, curved: bool, bonded: bool) -> Scene:
     """The scene without what a tool does not touch: other plans and meshes share one program."""
-    plan = make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False))
+    contact = "bonded" if bonded else "unilateral"
+    plan = make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False, contact=contact))
     return dataclasses.replace(
         scene, mesh=None, binding=None, runs=None, friction=None,
         plan=dataclasses.replace(plan, curved=curved),
@@ -180,16 +179,18 @@ def _touched(
     Float[Array, " rows"],
     tuple[Float[Array, ""], Float[Array, ""]],
 ]:
-    """Contact of every row and whether it is one with the outside; the way from first touch on.
+    """Contact of every row and whether it is one with the outside; the path as presses there.
 
     Returns:
         s, mm; phi, rad; whether the row touches from outside; displacement of the contact point,
         mm; the row of first touch; gap, mm; s and phi of the first touch.
     """
     seen = touch_tube(scene, path)
-    touching, row = first_touch(seen, in_lumen(scene, path, seen))
-    place = landing(scene, path, seen, row)
-    return seen.s, seen.phi, touching, place.way, row, seen.gap, (place.s, place.phi)
+    inside = in_lumen(scene, path, seen)
+    touching, row = first_touch(seen, inside)
+    presses = on_one_point(scene, path, seen, row, inside).presses
+    place = presses.s[0], presses.phi[0]
+    return seen.s, seen.phi, touching, presses.displacement, row, seen.gap, place
 
 
 #: Paths of any length share its program, and other starts its trace.

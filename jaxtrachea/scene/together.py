@@ -157,11 +157,8 @@ def press_together(
         lost = ~jnp.isfinite(jnp.sum(vectors["force"] + vectors["moment"], axis=2))
         status = jnp.where((status == PressStatus.OK) & lost, PressStatus.NON_FINITE, status)
     fields = mask_rows(hidden, vectors | rings)
-    return (
-        fields | _of_each(each, paths, made, found, fields, status, refused),
-        moved,
-        solved.history,
-    )
+    fields |= _of_each(each, paths, made, found, fields, status, refused)
+    return fields, moved, solved.history
 
 
 def _of_each(

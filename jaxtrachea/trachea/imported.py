@@ -130,19 +130,18 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
 
     file = _surfaces(path, unit, part, rings, step)
     wall, cartilage, scale, notes = file
-    notes = list(notes)
     given = None if known.centreline is None else np.asarray(known.centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
     check_turn(line)
     step()
-    shape = _turned_up(line, file, known.larynx)
+    shape = _from_the_carina(line, file, known.larynx)
     if given is None:
         shape.check_middle()
     step()
     shape = find_anterior(shape, known.anterior)
     holes = holes_of(wall, shape.line)
     if holes:
-        notes.append(f"{len(holes)} holes in the wall, the largest {holes[0].words}")
+        notes += (f"{len(holes)} holes in the wall, the largest {holes[0].words}",)
     if cartilage is not None:
         holes = holes_of(join_corners(cartilage)[0], shape.line)
     found = find_rings(shape, known.ring_positions, known.half_angle, holes)
@@ -198,7 +197,7 @@ def _surfaces(path: Path, unit, part, rings, step) -> _File:
                  (*notes, *cleaned))  # fmt: skip
 
 
-def _turned_up(line: Line, file: _File, larynx) -> Shape:
+def _from_the_carina(line: Line, file: _File, larynx) -> Shape:
     """The shape along the line from the carina to the larynx."""
 
     def scan(line):

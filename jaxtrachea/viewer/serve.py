@@ -1,7 +1,6 @@
 """A page on 127.0.0.1: its server, and the line that says where its work stands."""
 
 import secrets
-import socket
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -9,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from nicegui import app, ui
+from nicegui.server import Server
 
 from jaxtrachea.viewer.server import Guard
 from jaxtrachea.viewer.worker import Worker
@@ -81,7 +81,7 @@ def serve(
     ui.page("/", title=f"{title} - jaxtrachea")(lambda: page(worker).build())
 
     def tell() -> None:
-        while not _answers(port):
+        while not Server.instance.started:
             time.sleep(0.01)
         opened(f"http://127.0.0.1:{port}/?token={token}")
 
@@ -96,12 +96,3 @@ def serve(
         show_welcome_message=False, gzip_middleware_factory=None, ws_max_size=2**16,
         reconnect_timeout=30,  # a page that draws slowly is not a page that has gone
     )  # fmt: skip
-
-
-def _answers(port: int) -> bool:
-    """Whether a server listens."""
-    try:
-        socket.create_connection(("127.0.0.1", port), timeout=1).close()
-    except OSError:
-        return False
-    return True

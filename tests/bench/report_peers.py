@@ -100,7 +100,8 @@ steps to rest, eight at each depth. `mujoco.batch` presses the ten positions tog
 `mujoco.sysid.optimize` differentiates by differences, by its own solver or SciPy's. Ours fits
 500 specimens in one batch, with standard errors; the others two, one after the other. A press
 differs relative to the largest force (the servo, 1e4 N/mm, is in series with MuJoCo's contact), an
-estimate in standard errors.
+estimate in standard errors. Other work kept the machine busy (load 4 to 5), and MuJoCo's fits were
+timed once: orders of magnitude, no more.
 
 What MuJoCo does better: contact, friction, several bodies and motion in time come with the same
 model, without a rule which of them are solved together; a run of one batch has the same bits at any

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from small_scenes import BALL, BARE, MATERIAL, MESH, SPRINGS, TUBE, ball, presses
+from small_scenes import BALL, BARE, MATERIAL, MESH, OUTER, SPRINGS, TUBE, ball, presses
 
 from jaxtrachea import EffectOptions, PlanError, Poses, make_scene, simulate
 from jaxtrachea.scene import facts as scene_facts
@@ -149,3 +149,15 @@ def test_presses_at_several_places_are_told_a_cure_that_works():
     facts = SceneFacts(several_points=True, timed=True, known=frozenset({RELAXES}))
     with pytest.raises(PlanError, match="simulate the presses of each place by themselves"):
         make_plan(facts, EffectOptions())
+
+
+def test_rows_that_are_clear_of_a_round_wall_ask_for_no_depth():
+    """4 mm round the tube the tangent plane lies 0.45 mm above a ball that is 0.2 mm clear."""
+    r = OUTER + np.array([5.2, 5.2, 5.2, 4.9])
+    angle = np.array([-4, -2, 0, 0]) / r[0]
+    places = np.stack([0 * r + 75, r * np.cos(angle), r * np.sin(angle)], axis=1)
+    path = Poses(np.broadcast_to(np.eye(3), (4, 3, 3)), places)
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
+    facts = scene_facts.facts_of(scene, SPRINGS, path)
+    depth = facts.way_fixed[1] * float(TUBE.radius)
+    assert 0.1 < depth < 0.13  # the patches of a round wall stand 0.02 mm out

@@ -4,9 +4,8 @@ The truth is of the matrix as the dtype holds it: mpmath's inverse with 40 digit
 the eigenvalues by LAPACK in float64 (roundings of 1e-16, the smallest eigenvalue is 1e-6).
 
 Tolerances: of such positive definite matrices elimination entry by entry has
-errors of 0.015 eps cond (median of 400) and 0.3 eps cond (the largest), elimination by halves 1.2
-and 600, with wrong inertia of one in 20 at cond = 0.1 / eps. Pivots are not exchanged, so that
-of indefinite ones the median is looser.
+errors of 0.015 eps cond (median of 400) and 0.3 eps cond (the largest). Pivots are not exchanged,
+so that of indefinite ones the median is looser.
 """
 
 import jax

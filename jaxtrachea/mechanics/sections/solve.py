@@ -238,15 +238,14 @@ def _solve_path_jvp(primals, tangents):
     still = isinstance(tangents[1], SymbolicZero)
     way = jnp.zeros_like(displacement) if still else tangents[1]
 
-    tangent = jax.vmap(lambda z, D: _system.linearise(z, D, system)[1])(found.state, displacement)
-
-    def one(state, D, D_grown, tangent):
+    def one(state, D, D_grown):
         def off(D, moved):
             return _system.residual(state, D, tree.unflatten(replaced(values, moving, moved)))
 
         _, grown = jax.jvp(off, (D, given[0]), (D_grown, given[1]))
+        _, tangent = _system.linearise(state, D, system)
         return jax.tree.map(jnp.negative, _system.solve_linear(tangent, grown))
 
-    grown = jax.vmap(one)(found.state, displacement, way, tangent)
+    grown = jax.vmap(one)(found.state, displacement, way)
     none = jnp.zeros_like(found.solved)
     return found, Solved(grown, none, none, none)
