@@ -17,6 +17,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.zero_messages import sentences_of_fits
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.results.arrays import arrays_of
 from jaxtrachea.results.read import read_results
 from jaxtrachea.trachea.geometry import table_1
 
@@ -106,6 +107,23 @@ def test_lanes_without_zeros_are_fitted_as_by_themselves(mixed, monkeypatch):
     for name in ("value", "standard_error", "evidence_low", "cost", "sigma", "status", "minima"):
         one, other = getattr(apart, name), getattr(together, name)
         np.testing.assert_allclose(one, other, rtol=1e-6, err_msg=name)
+
+
+def test_a_shard_that_takes_no_zeros_has_a_model_without_them(mixed, monkeypatch):
+    """Where other lanes of its study take some: all of one shard, none of the next."""
+    *_, result = mixed
+    takes, settings = result.study.takes_zeros, Settings(starts=2)
+    study = result.study.take(np.flatnonzero(~takes))
+    together = fit(study, settings)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.MANY_WITHOUT", 1)
+    apart = fit(study, settings)
+    assert np.isnan(apart.uncertainty.dispersion[:, 3:]).all()  # a model without zeros
+    for name, one in arrays_of(apart).items():
+        other = arrays_of(together)[name]
+        assert one.shape == other.shape, name
+        if name in ("value", "standard_error", "cost", "sigma", "status", "minima"):
+            np.testing.assert_allclose(one, other, rtol=1e-6, err_msg=name)
+    assert apart.study.size == result.study.size
 
 
 def test_notes_name_curve_and_value(mixed):

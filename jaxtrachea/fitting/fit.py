@@ -13,7 +13,6 @@ from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.evaluate import evaluated
 from jaxtrachea.fitting.force_share import (
     MAX_ITERATIONS,
-    Levels,
     changed,
     next_levels,
     with_found_shares,
@@ -133,13 +132,16 @@ def _by_zeros(study: Study, settings: Settings, progress, starts, beside) -> Fit
     takes = study.takes_zeros
     rows, others = np.flatnonzero(takes), np.flatnonzero(~takes)
     refit = starts is not None or beside is not None or study.joint
-    if refit or not len(rows) or len(others) * settings.starts < MANY_WITHOUT:
+    seeks = any(p.auto and not p.fixed for p in study.parameters)
+    if refit or not seeks or len(others) * settings.starts < MANY_WITHOUT:
         return _without_more_zeros(study, settings, progress, starts, beside)
     jobs = len(takes) * settings.starts
     alive = None if progress is None else lambda done, _: progress(done, jobs)
     part = without_zeros(study.take(others))
     result = _without_more_zeros(part, settings, alive, None, None)
-    new = _without_more_zeros(study.take(rows), settings, alive, None, None)
+    new = None
+    if len(rows):
+        new = _without_more_zeros(study.take(rows), settings, alive, None, None)
     return merged(study, result, rows, new)
 
 
@@ -170,21 +172,21 @@ def _with_force_share(found: _Found, settings: Settings, progress) -> _Found:
     """
     alive = None if progress is None else lambda done, of: progress(0, of)
     result, minima, known = found
-    levels = None
+    levels, rows = None, np.arange(result.lanes)
     for _ in range(MAX_ITERATIONS):
-        wanted, force = next_levels(result)
-        rows = changed(levels, wanted)
-        if result.study.joint and len(rows):
-            rows = np.arange(result.lanes)
-        if not len(rows):
+        wanted, force = next_levels(result, rows)
+        moved = changed(levels and levels.take(rows), wanted)
+        if result.study.joint and len(moved):
+            moved = rows
+        if not len(moved):
             if levels is None:  # refits need not look again
                 none = dataclasses.replace(result.study, force_share=None)
                 result = dataclasses.replace(result, study=none)
             break
-        _log.info("%d fits again with a share of the force in the noise", len(rows))
-        new = Levels(*(v[rows] for v in wanted))
+        _log.info("%d fits again with a share of the force in the noise", len(moved))
+        new, rows = wanted.take(moved), rows[moved]
         levels = wanted if levels is None else levels.replaced(rows, new)
-        part = with_levels(result.study.take(rows), new, force[rows])
+        part = with_levels(result.study.take(rows), new, force[moved])
         study = with_found_shares(found.result.study, result.study, rows, part)
         again = _lowest(part, settings, alive, None, result.theta[rows])
         minima = minima.without_ends(rows).replaced(rows, again.minima)

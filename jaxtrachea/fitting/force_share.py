@@ -6,6 +6,7 @@ of a fit by maximum likelihood, in turns with the fit. F is the force that the f
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +24,8 @@ WORTH = 9.0
 MAX_ITERATIONS, SHARE_TOLERANCE = 8, 0.02
 #: Least sigma over the largest force, so that no sample of hardly any force counts alone.
 LEAST = 2e-4
-#: Shares over sigma, times the largest force, that are tried.
-_RATIOS = np.geomspace(1e-2, 1 / LEAST, 121)
+#: Shares over sigma, times the largest force, that are tried, one in so many before those beside.
+_RATIOS, _COARSE = np.geomspace(1e-2, 1 / LEAST, 121), 4
 
 
 class Levels(NamedTuple):
@@ -32,6 +33,10 @@ class Levels(NamedTuple):
 
     sigma: Float[np.ndarray, " lanes"]
     share: Float[np.ndarray, " lanes"]
+
+    def take(self, rows: Int[np.ndarray, " n"]) -> "Levels":
+        """Those of some lanes."""
+        return Levels(*(v[rows] for v in self))
 
     def replaced(self, rows: Int[np.ndarray, " n"], by: "Levels") -> "Levels":
         """With other rows."""
@@ -108,27 +113,35 @@ def _replaced(values, rows: Int[np.ndarray, " n"], by) -> np.ndarray:
     return out
 
 
-def next_levels(result: FitResult) -> tuple[Levels, Float[np.ndarray, "lanes T N"]]:
+def next_levels(
+    result: FitResult, lanes: Int[np.ndarray, " n"]
+) -> tuple[Levels, Float[np.ndarray, "n T N"]]:
     """Sigma and share by the residuals of a fit, and the forces that it predicts without offset.
 
     A share that is given is kept; one that gains less than `WORTH` is 0.
+
+    Args:
+        result: of the fit.
+        lanes: whose levels are sought; all of a joint study.
     """
     study = result.study
-    residual = result.residuals["force"]
-    force = np.asarray(study.lanes.force) - offsets(study, result.theta)[..., None]
+    residual = result.residuals["force"][lanes]
+    zero = offsets(study, result.theta)[lanes, :, None]
+    force = np.asarray(study.lanes.force)[lanes] - zero
     force = np.where(np.isfinite(residual), force + residual, force)
-    plain = study.lanes.precision if study.shares is None else study.shares.plain
-    rows = range(result.lanes)
+    plain = (study.lanes.precision if study.shares is None else study.shares.plain)[lanes]
+    rows = range(len(lanes))
     groups = [list(rows)] if study.joint else [[k] for k in rows]
-    sigma, share = np.ones(result.lanes), np.zeros(result.lanes)
+    sigma, share = np.ones(len(lanes)), np.zeros(len(lanes))
     for group in groups:
-        group = [k for k in group if result.succeeded[k]]
+        group = [k for k in group if result.succeeded[lanes[k]]]
         r, F, p = (np.concatenate([v[k].ravel() for k in group] or [np.zeros(0)])
                    for v in (residual, force, plain))  # fmt: skip
         seen = np.isfinite(r) & (p > 0)
         if not seen.any():
             continue
-        left = 1 - np.sum(study.lanes.active[group]) / max(np.sum(result.samples[group]), 1)
+        of = lanes[group]
+        left = 1 - np.sum(study.lanes.active[of]) / max(np.sum(result.samples[of]), 1)
         r, F, p = r[seen] / np.sqrt(max(left, 0.05)), np.abs(F[seen]), p[seen]
         wanted = study.force_share
         given = None if isinstance(wanted, str) or wanted is None else float(wanted)
@@ -160,29 +173,40 @@ def _most_likely(r, F, p, sigma_given: bool, share: float | None) -> tuple[float
     peak = float(np.max(F, initial=0))
     if peak == 0:
         return 1.0 if sigma_given else max(float(np.std(r)), 1e-300), 0.0
-    if sigma_given:
-        shares = np.concatenate([[0], _RATIOS * LEAST])
-        variance = 1 / p**2 + (shares[:, None] * F) ** 2
-        cost = np.sum(r**2 / variance + np.log(variance), axis=1)
-        return (1.0, share) if share is not None else (1.0, float(shares[_chosen(cost)]))
+    if share is not None and sigma_given:
+        return 1.0, share
     if share is not None:
         sigmas = peak * np.geomspace(LEAST, 1, 121)
         variance = sigmas[:, None] ** 2 + (share * F) ** 2
         cost = np.sum(r**2 / variance + np.log(variance), axis=1)
         return float(sigmas[np.argmin(cost)]), share
-    ratios = np.concatenate([[0], _RATIOS / peak])
-    grown = 1 + (ratios[:, None] * F) ** 2
-    squared = np.maximum(np.mean(r**2 / grown, axis=1), 1e-300)
-    cost = len(r) * np.log(squared) + np.sum(np.log(grown), axis=1)
-    best = _chosen(cost)
-    sigma = float(np.sqrt(squared[best]))
-    return max(sigma, LEAST * peak if best else 0.0), float(ratios[best]) * sigma
+    squares = np.square([r, F])
+
+    def given(shares):
+        variance = 1 / p**2 + (shares**2)[:, None] * squares[1]
+        return np.sum(squares[0] / variance + np.log(variance), axis=1)
+
+    def estimated(ratios):
+        grown = 1 + (ratios**2)[:, None] * squares[1]
+        squared = np.maximum(np.mean(squares[0] / grown, axis=1), 1e-300)
+        return len(r) * np.log(squared) + np.sum(np.log(grown), axis=1)
+
+    if sigma_given:
+        return 1.0, _worth(given, _RATIOS * LEAST)
+    best = _worth(estimated, _RATIOS / peak)
+    sigma = np.sqrt(max(np.mean(squares[0] / (1 + best**2 * squares[1])), 1e-300))
+    return float(max(sigma, LEAST * peak if best else 0.0)), best * float(sigma)
 
 
-def _chosen(cost: np.ndarray) -> int:
-    """The least of the costs, the first (no share) unless another gains `WORTH`."""
-    best = int(np.argmin(cost))
-    return best if cost[0] - cost[best] > WORTH else 0
+def _worth(cost: Callable, ratios: np.ndarray) -> float:
+    """The ratio of least cost, 0 unless that gains `WORTH`; found on every fourth, then beside."""
+    first = np.arange(0, len(ratios), _COARSE)
+    none, *coarse = cost(np.concatenate([[0.0], ratios[first]]))
+    middle = first[np.argmin(coarse)]
+    beside = ratios[max(middle - _COARSE + 1, 0) : middle + _COARSE]
+    fine = cost(beside)
+    best = int(np.argmin(fine))
+    return float(beside[best]) if none - fine[best] > WORTH else 0.0
 
 
 def changed(before: Levels | None, after: Levels) -> Int[np.ndarray, " n"]:

@@ -22,12 +22,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.cost import robust
+from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.effective import CORRELATED, lag_correlation, share_independent
 from jaxtrachea.fitting.force_share import with_found_shares
 from jaxtrachea.fitting.lane import force_entries
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.residual import residual_value
-from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.result import OF_UNKNOWNS, FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.record_zeros import LEAST_NOISE, SHOWN, TOLD_APART
 
@@ -381,7 +382,7 @@ _ZERO = (
 
 
 def merged(
-    study: Study, result: FitResult, rows: Int[np.ndarray, " n"], new: FitResult
+    study: Study, result: FitResult, rows: Int[np.ndarray, " n"], new: FitResult | None
 ) -> FitResult:
     """A result in which some lanes are fitted with more unknowns, the others as they were.
 
@@ -389,7 +390,7 @@ def merged(
         study: of all lanes, with these unknowns.
         result: without them, of all lanes, or of all that are not in `rows`, in their order.
         rows: lanes of `new`.
-        new: of these lanes.
+        new: of these lanes; None where there are none.
     """
     lanes, before = len(study.unknowns), result.study
     if result.lanes < lanes:  # what stands in the place of `rows` is written over
@@ -397,22 +398,27 @@ def merged(
         before = before.take(place)
     else:
         place = np.arange(lanes)
-    study = with_found_shares(study, before, rows, new.study)
+    of_rows = before.take(rows) if new is None else new.study
+    study = with_found_shares(study, before, rows, of_rows)
 
     def both(name, old, other):
-        more = [(0, 0), *((0, b - a) for a, b in zip(old.shape[1:], other.shape[1:], strict=True))]
+        of_unknowns = old.ndim - 1 if name in Uncertainty._fields else int(name in OF_UNKNOWNS)
+        more = [(0, 0)] * old.ndim
+        for axis in range(1, 1 + of_unknowns):
+            more[axis] = 0, study.size - old.shape[axis]
         blank = 0 if name in _ZERO or old.dtype == bool else -1 if old.dtype.kind == "i" else np.nan
         out = np.pad(old, more, constant_values=blank)[place]
-        out[rows] = other
+        if other is not None:
+            out[rows] = getattr(other, name)
         return out
 
     def every(names, old, other):
-        return {n: both(n, getattr(old, n), getattr(other, n)) for n in names}
+        return {n: both(n, getattr(old, n), other) for n in names}
 
     arrays = [f.name for f in dataclasses.fields(result)]
     arrays = [n for n in arrays if isinstance(getattr(result, n), np.ndarray)]
     records = {
-        name: type(old)(**every(old._fields, old, getattr(new, name)))
+        name: type(old)(**every(old._fields, old, None if new is None else getattr(new, name)))
         for name in ("criteria", "uncertainty")
         for old in [getattr(result, name)]
     }

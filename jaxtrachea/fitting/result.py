@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     import xarray
 
 
+#: Fields of a result whose second axis is that of a lane's unknowns.
+OF_UNKNOWNS = (
+    "theta", "value", "standard_error", "lower", "upper", "relative_se", "at_bound",
+    "undetermined", "unexamined", "evidence_low", "evidence_high", "evidence_end",
+)  # fmt: skip
+
+
 class Origin(NamedTuple):
     """Where a fit was read from; empty for one of this process.
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.force_share import as_weighed, with_shares
-from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.result import OF_UNKNOWNS, FitResult
 from jaxtrachea.fitting.study import Shares, Study
 
 _APART = ("study", "criteria", "uncertainty", "origin", "stored_residuals")
@@ -19,14 +19,10 @@ STORED_AS = {
 }  # fmt: skip
 #: Fields of a result that are arrays with the leading axis of lanes.
 FIELDS = tuple(f.name for f in dataclasses.fields(FitResult) if f.name not in _APART)
-#: Those of single unknowns, which lie in the group of that name.
-OF_UNKNOWNS = (
-    "theta", "value", "standard_error", "lower", "upper", "relative_se", "at_bound",
-    "undetermined", "unexamined", "evidence_low", "evidence_high", "evidence_end",
-)  # fmt: skip
 
 
 def _places() -> dict[str, str]:
+    """Fields of single unknowns lie in a group of their own."""
     found = {n: f"unknowns/{n}" if n in OF_UNKNOWNS else f"lanes/{n}" for n in FIELDS}
     found |= {f"criteria.{name}": f"lanes/{name}" for name in Criteria._fields}
     local = {STORED_AS.get(name, name) for name in Uncertainty._fields}
