@@ -403,7 +403,7 @@ def _bends(
     return bends
 
 
-def _without_own(source: CurveParameters, change: np.ndarray) -> np.ndarray:
+def _without_own(source: CurveParameters, change: Any) -> np.ndarray:
     """A change of the force, (..., N), less what the curve's own parameters take up of it."""
     if source.refitted_own is None:
         return change

@@ -52,7 +52,7 @@ class CurveParameters:
     message: str
     refitted_own: tuple[np.ndarray, np.ndarray] | None = None
     blend: float = np.nan
-    index: np.ndarray | None = None
+    index: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
 
 
 def source_of(
