@@ -31,6 +31,7 @@ class Predicted(NamedTuple):
         bend: how far the force leaves its tangent where the parameters move to either end of the
             band at the deepest displacement, N; (2, N).
         deepest: index of that displacement.
+        slope: derivative of the force by the free columns, N; (free, N).
     """
 
     value: Values
@@ -38,6 +39,7 @@ class Predicted(NamedTuple):
     status: Int[Array, "*n"]
     bend: Float[Array, "2 ..."]
     deepest: Int[Array, ""]
+    slope: Float[Array, "free ..."]
 
 
 def respond(
@@ -123,7 +125,7 @@ def predicted(
         bends = jax.vmap(bend)(jnp.asarray([1.0, -1.0], free.dtype))
     else:
         bends = jnp.stack([bend(1.0), bend(-1.0)])
-    return Predicted(out, se, status, bends, deepest)
+    return Predicted(out, se, status, bends, deepest, slopes["force"])
 
 
 def force_and_slope(model: FitModel, free, value, motion: Motion):

@@ -28,6 +28,7 @@ from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Estimate, Predicted, Values, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
 from jaxtrachea.prediction.pressed import pressed
+from jaxtrachea.prediction.profile import error_of_ends, has_profile
 from jaxtrachea.prediction.sources import (
     CurveParameters,
     detection_limit,
@@ -185,26 +186,40 @@ def predict_sources(
         phi_c, direction = (jnp.asarray(np.array(v, float)) for v in (phis, ways))
         motion = motion._replace(phi_c=phi_c, direction=direction)
     blend = stack("blend")
-    out: dict[int, CurvePrediction] = {}
-    for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
-        # A rounded corner is another program; mostly all curves have one, or none.
-        rounded = not np.isnan(blend[members]).all()
-        arrays = estimates, motion._replace(blend=blend if rounded else None), slack
-        size = min(batch, _rounded(max(len(members), 1), 8))
-        for first in range(0, len(members), size):
-            at = members[first : first + size]
-            rows = np.pad(at, (0, size - len(at)), mode="edge")
-            of_rows = jax.tree.map(lambda v, rows=rows: jnp.asarray(v[rows]), arrays)
-            part = jax.tree.map(np.asarray, run(*of_rows))
-            for row, k in enumerate(at):
-                own = jax.tree.map(lambda v, row=row: v[row], part)
-                sigma = None if sigmas is None else sigmas[k]
-                where = (s[k], *turned[k])
-                found = _on_host(stored, sources[k], where, displacements[k], own, sigma)
-                if times is not None:
-                    found = _in_time(stored, sources[k], found, np.asarray(times[k], np.float64))
-                out[k] = _with_misfit(stored, sources[k], errors.get(sources[k].lane), found)
-    return [out[k] for k in range(len(sources))]
+
+    def answers(rows, free) -> Any:
+        """`Predicted` of curves, numpy, their free parameters given; one row each."""
+        out = None
+        for members in (np.isnan(blend[rows]), ~np.isnan(blend[rows])):
+            members = np.flatnonzero(members)
+            # A rounded corner is another program; mostly all curves have one, or none.
+            rounded = not np.isnan(blend[rows[members]]).all()
+            arrays = estimates, motion._replace(blend=blend if rounded else None), slack
+            size = min(batch, _rounded(max(len(members), 1), 8))
+            for first in range(0, len(members), size):
+                at = members[first : first + size]
+                full = np.pad(at, (0, size - len(at)), mode="edge")
+                of_rows = jax.tree.map(lambda v, full=full: jnp.asarray(v[rows[full]]), arrays)
+                of_rows = of_rows[0]._replace(free=jnp.asarray(free[full])), *of_rows[1:]
+                part = jax.tree.map(np.asarray, run(*of_rows))
+                if out is None:
+                    out = jax.tree.map(lambda v: np.empty((len(rows), *v.shape[1:]), v.dtype), part)
+                for whole, some in zip(jax.tree.leaves(out), jax.tree.leaves(part), strict=True):
+                    whole[at] = some[: len(at)]
+        return out
+
+    every = answers(np.arange(len(sources)), estimates.free)
+    parts = [jax.tree.map(lambda v, k=k: v[k], every) for k in range(len(sources))]
+    bends = _bends(stored, sources, displacements, parts, errors, answers)
+    out = []
+    for k, (source, part, bend) in enumerate(zip(sources, parts, bends, strict=True)):
+        sigma = None if sigmas is None else sigmas[k]
+        where = (s[k], *turned[k])
+        found = _on_host(stored, source, where, displacements[k], part, sigma, bend)
+        if times is not None:
+            found = _in_time(stored, source, found, np.asarray(times[k], np.float64))
+        out.append(_with_misfit(stored, source, errors.get(source.lane), found))
+    return out
 
 
 def _widened(source: CurveParameters, error: ModelError | None) -> CurveParameters:
@@ -259,7 +274,7 @@ def _rounded(count: int, least: int) -> int:
 
 
 def _on_host(
-    stored: FitResult, source: CurveParameters, where, displacement, part: Predicted, sigma
+    stored: FitResult, source: CurveParameters, where, displacement, part: Predicted, sigma, bend
 ):
     """One curve at `where` (s, angle, direction), cut to its length, with its status."""
     n = len(displacement)
@@ -280,7 +295,6 @@ def _on_host(
         return hide(v) if skeleton and v is not None else np.full_like(value["joints"], np.nan)
 
     presses = np.asarray(part.status[:n])
-    bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
     outside, foreign = _outside(stored, source, where, displacement) if usable else ([], [])
     status, message = _verdict(source, value, se, presses, bend, foreign)
     return CurvePrediction(
@@ -337,22 +351,72 @@ def _marker_sigma(stored: FitResult, source: CurveParameters, displacement) -> n
     return 1 / Noise(joints=given[0], joints_share=given[1]).joints_precision(depth)
 
 
-def _bend(
-    source: CurveParameters, off: np.ndarray, value: Values, se: Values, deepest: int
-) -> float:
-    """Error of the linear band at its ends, at the deepest displacement, in half-widths.
+def _bends(
+    stored: FitResult, sources, displacements, parts: list[Predicted], errors, answers
+) -> np.ndarray:
+    """Error of each linear band at its ends, at the deepest displacement, in half-widths.
 
-    What the curve's own parameters take up does not count: they are fitted to it.
+    By a straight walk along the covariance of the estimates, and where that says that it is bent
+    by the profile of the force, which takes longer. What the curve's own parameters take up does
+    not count: they are fitted to it.
     """
-    half = float(source.half_width * se["force"][deepest])
-    if not (np.isfinite(half) and half > 0 and np.isfinite(value["force"][deepest])):
-        return 0.0
-    if source.refitted_own is not None:
-        slope, gain = source.refitted_own
-        off = off - (off @ gain.T) @ slope.T
-    worst = np.max(np.abs(off[:, deepest])) / half
-    # No solution within the band (past a fold): as bent as can be.
-    return float(worst) if np.isfinite(worst) else np.inf
+    bends = np.zeros(len(sources))
+    slopes, doubts = {}, []
+    for k, (source, part) in enumerate(zip(sources, parts, strict=True)):
+        n, deepest = len(displacements[k]), int(part.deepest)
+        half = float(source.half_width * part.se["force"][deepest])
+        if not (np.isfinite(half) and half > 0 and np.isfinite(part.value["force"][deepest])):
+            continue
+        worst = np.max(np.abs(_without_own(source, part.bend[:, :n])[:, deepest])) / half
+        # No solution within the band (past a fold): as bent as can be.
+        bends[k] = worst if np.isfinite(worst) else np.inf
+        slopes[k] = _without_own(source, part.slope[:, :n])[:, deepest]
+        if bends[k] > BENT and slopes[k] @ source.covariance @ slopes[k] > 0:
+            doubts.append(k)
+    if not (doubts and has_profile(stored)):
+        return bends
+    rows = np.repeat(doubts, 2)
+    columns = [_unknowns_of(stored, sources[k]) for k in rows]
+
+    def force(moved):
+        free = np.stack(
+            [sources[k].free + M @ by for k, M, by in zip(rows, columns, moved, strict=True)]
+        )
+        part, changes, by_unknowns = answers(rows, free), [], []
+        for i, k in enumerate(rows):
+            n, deepest = len(displacements[k]), int(part.deepest[i])
+            change = part.value["force"][i, :n] - parts[k].value["force"][:n]
+            changes.append(_without_own(sources[k], change)[deepest])
+            slope = _without_own(sources[k], part.slope[i, :, :n])[:, deepest]
+            by_unknowns.append(columns[i].T @ slope)
+        return np.array(changes), np.stack(by_unknowns)
+
+    lanes = np.array([sources[k].lane for k in rows])
+    growth = np.array([errors[lane].growth for lane in lanes])
+    half = np.array([sources[k].half_width for k in rows])
+    pulls = np.array([slopes[k] @ sources[k].covariance @ slopes[k] for k in rows])
+    target = np.tile([1.0, -1.0], len(doubts)) * half * np.sqrt(pulls)
+    expected = (half * np.where(np.isfinite(growth), growth, 1.0)) ** 2
+    found = error_of_ends(stored, lanes, force, target, expected)
+    worst = np.max(found.reshape(-1, 2), axis=1)  # NaN stays
+    bends[doubts] = np.where(np.isnan(worst), bends[doubts], worst)
+    return bends
+
+
+def _without_own(source: CurveParameters, change: Any) -> np.ndarray:
+    """A change of the force, (..., N), less what the curve's own parameters take up of it."""
+    if source.refitted_own is None:
+        return change
+    slope, gain = source.refitted_own
+    return change - (change @ gain.T) @ slope.T
+
+
+def _unknowns_of(stored: FitResult, source: CurveParameters) -> np.ndarray:
+    """Derivative of the free columns of a curve by the unknowns of its lane; (F, P)."""
+    out = np.zeros((len(source.free), stored.theta.shape[1]))
+    known = np.flatnonzero(source.index >= 0)
+    out[known, source.index[known]] = 1
+    return out
 
 
 def _beyond(spans: np.ndarray, s: float, depth: np.ndarray, aside=(), counted: str = "") -> str:

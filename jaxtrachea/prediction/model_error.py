@@ -131,13 +131,13 @@ def model_errors(stored: FitResult, lanes: list[int]) -> dict[int, ModelError]:
             batch=study.batch_size(len(missing), 256),
         )  # fmt: skip
         for k, lane in enumerate(missing):
-            X = _over_unknowns(study, k, jacobian[k], stored.at_bound[lane])
+            X = over_unknowns(study, k, jacobian[k], stored.at_bound[lane])
             left = _LeftOut(value[k], X, root[k], study.lanes.force.shape[-1])
             kept[lane] = _of_lane(stored, lane, study.curves[k], left)
     return {lane: kept[lane] for lane in lanes if lane >= 0}
 
 
-def _over_unknowns(
+def over_unknowns(
     study: Study, lane: int, jacobian: Float[np.ndarray, "T Jf m"], at_bound: np.ndarray
 ) -> Float[np.ndarray, "T P m"]:
     """Jacobian by the lane's unknowns; 0 for what is held, or shared with other lanes."""

@@ -35,6 +35,7 @@ class CurveParameters:
             gain that fits them (k, N); None if they are not fitted.
         blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; NaN: that of the
             options.
+        index: unknown of the lane that each free column reads; -1: none; (F,).
     """
 
     specimen: str
@@ -51,6 +52,7 @@ class CurveParameters:
     message: str
     refitted_own: tuple[np.ndarray, np.ndarray] | None = None
     blend: float = np.nan
+    index: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
 
 
 def source_of(
@@ -208,6 +210,7 @@ def _taken(stored: FitResult, specimen, trial, lane: int, index, own, note: str)
         own=own,
         status=status,
         message="; ".join(said),
+        index=index,
     )
 
 

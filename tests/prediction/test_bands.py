@@ -5,12 +5,14 @@ import math
 import shutil
 from pathlib import Path
 
+import beam_fem
 import h5py
 import numpy as np
 import pytest
 import synthetic
 from hardening import TWO, pairs, stored_again, total_study
 from noisy_fits import DEPTHS, NOISE, UNSEEN, noisy_study, true_force
+from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import jaxtrachea
@@ -128,6 +130,61 @@ def test_a_band_that_the_model_bends_in_is_said(read):
     wide = dataclasses.replace(source, covariance=1e4 * source.covariance)
     (curve,) = predict_sources(read, [wide], [61.0], [np.array([3.0])])
     assert curve.status == PredictionStatus.BENT
+
+
+def rise_at(read, lane, s, target):
+    """Twice the rise of the cost where the force at s is held at `target`; an independent beam."""
+    x, curves = np.asarray(table_1().ring_positions), read.study.curves[lane]
+    data = np.concatenate([c.force for c in curves]), float(read.sigma[lane, 0])
+
+    def forces(theta, places, depths):
+        EI, k_M, k_1, k_3 = np.exp(theta)
+        out = []
+        for at in places:
+            c = float(beam_fem.solve(x, 160.0, [EI] * 16, [k_M] * 15, at, 1.0).w_C)
+            d = depths.copy()
+            for _ in range(60):  # Newton, from above a convex function's root
+                F = k_1 * d + k_3 * d**3
+                d -= (d + c * F - depths) / (1 + c * (k_1 + 3 * k_3 * d**2))
+            out.append(k_1 * d + k_3 * d**3)
+        return np.concatenate(out)
+
+    def off(theta):
+        return (forces(theta, [c.s_c for c in curves], DEPTHS) - data[0]) / data[1]
+
+    def held(theta):
+        at = forces(theta, [s], DEPTHS[-1:]) - target
+        return np.concatenate([off(theta), 1e5 * at])
+
+    theta = np.log(read.value[lane])
+    found = least_squares(held, theta, method="lm", xtol=1e-12, ftol=1e-12)
+    return np.sum(off(found.x) ** 2) - np.sum(off(theta) ** 2)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_bent_is_what_the_profile_of_the_force_says(tmp_path, monkeypatch):
+    """Noise of a sixth of the force: a straight walk leaves the valley and calls most bent."""
+    lanes = 12
+    noisy_study(tmp_path, 0.5, lanes, 7)
+    read = jaxtrachea.read_results(tmp_path)
+    sources = [source_of(read, name) for name in pressed(read).specimens]
+
+    def statuses():
+        found = predict_sources(read, sources, [75.0] * lanes, [DEPTHS] * lanes)
+        return found, np.array([p.status == PredictionStatus.BENT for p in found])
+
+    found, bent = statuses()
+    for lane in np.flatnonzero(~bent)[:4]:
+        p, half = found[lane], found[lane].half_width * read.effective.growth[lane]
+        ends = p.force[-1] + np.array([1, -1]) * p.half_width * p.se[-1]
+        rises = np.array([rise_at(read, lane, 75.0, end) for end in ends])
+        assert np.max(np.abs(half / np.sqrt(rises) - 1)) < 0.5
+    monkeypatch.setattr("jaxtrachea.prediction.curves.has_profile", lambda _: False)
+    _, straight = statuses()
+    assert np.sum(straight) >= 8
+    assert np.sum(bent) <= 4
+    assert straight[bent].all()
 
 
 def test_without_a_sample_to_spare_the_noise_band_is_infinite(study, tmp_path):
