@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.curve_noise import weighed_by_curve
@@ -103,16 +104,23 @@ def build_study(
     return _built(curves, recipe)
 
 
-def with_zeros(study: Study, asked: Taken) -> Study:
+def with_zeros(study: Study, asked: Taken, lanes: Int[np.ndarray, " n"] | None = None) -> Study:
     """A study built again, in which curves take further zeros.
 
     Args:
         study: one with a recipe.
         asked: names of `auto` parameters that curves take on top of those which their records show
             and which the study has already.
+        lanes: of these alone; None: of all.
     """
     recipe = study.recipe
     assert recipe is not None
+    if lanes is not None:
+        of = np.repeat(np.arange(len(study.curves)), [len(lane) for lane in study.curves])
+        rows = np.concatenate([np.flatnonzero(of == k) for k in lanes])
+        zeros = recipe.zeros and Zeros(*(v[rows] for v in recipe.zeros))
+        recipe = dataclasses.replace(recipe, asked=asked, zeros=zeros)
+        return _built([c for k in lanes for c in study.curves[k]], recipe)
     every = {k: {*recipe.asked.get(k, ()), *asked.get(k, ())} for k in {*recipe.asked, *asked}}
     curves = [c for lane in study.curves for c in lane]
     again = _built(curves, dataclasses.replace(recipe, asked=every), study)

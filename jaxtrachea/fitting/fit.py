@@ -18,6 +18,7 @@ from jaxtrachea.fitting.force_share import (
     with_found_shares,
     with_levels,
 )
+from jaxtrachea.fitting.hidden_air import hidden_air
 from jaxtrachea.fitting.information import fixed_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
@@ -27,7 +28,7 @@ from jaxtrachea.fitting.minima import (
 )
 from jaxtrachea.fitting.needs_review import needs_review, still_needs_review
 from jaxtrachea.fitting.noise import next_sigma, normal_psi2, precision_unit
-from jaxtrachea.fitting.omitted_zeros import asked_for, merged, near_estimates
+from jaxtrachea.fitting.omitted_zeros import Asked, asked_for, merged, near_estimates
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
@@ -105,9 +106,16 @@ def with_omitted_zeros(
         progress: as for `fit`.
     """
     alive = None if progress is None else lambda done, of: progress(0, of)
+    if study.recipe is None:
+        return result
+    quick = dataclasses.replace(settings, verify=False)
+    asked = hidden_air(
+        study, result, lambda part: _without_more_zeros(part, quick, alive, None, None)
+    )
     rows = np.arange(result.lanes)  # who asked for nothing does not later
     for _ in range(MORE_ZEROS):
-        if study.recipe is None or not (asked := asked_for(result, rows)).names:
+        asked = asked if asked.names else asked_for(result, rows)
+        if not asked.names:
             break
         study = with_zeros(study, asked.names)
         near = near_estimates(result, study, asked)
@@ -117,6 +125,7 @@ def with_omitted_zeros(
         vars(result).pop("residuals", None)
         new = _without_more_zeros(study.take(rows), settings, alive, None, near[rows])
         result = merged(study, result, rows, new)
+        asked = Asked({}, {})
     return result
 
 

@@ -89,7 +89,7 @@ def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
     Args:
         among: lanes that are looked at, in order.
     """
-    able = _able(result)
+    able = able_zeros(result)
     lanes = among[able[among].any(axis=(1, 2))]
     out = Asked({}, {})
     for first in range(0, len(lanes) if result.study.size else 0, TOGETHER):
@@ -160,7 +160,7 @@ def _rows(columns: _Columns, n: int, places) -> tuple[np.ndarray, np.ndarray]:
     return J, C.reshape(len(places), J.shape[1])
 
 
-def _able(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
+def able_zeros(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
     """Zeros that curves have not taken and might, of lanes that have an estimate to be wrong."""
     study = result.study
     out = np.zeros((result.lanes, len(ZEROS), study.lanes.s_c.shape[1]), bool)
@@ -367,7 +367,7 @@ def near_estimates(result: FitResult, again: Study, asked: Asked) -> Float[np.nd
         for i, (p, specimen, trial) in enumerate(unknowns):
             j = before.get((p.name, specimen, trial))
             value = asked.value.get((specimen, trial, p.name), np.nan)
-            if j is not None:
+            if np.isnan(value) and j is not None:
                 value = float(result.value[lane, j])
             if np.isfinite(value) and (value > 0 or p.scale != "log"):
                 out[lane, i] = p.to_scaled(value)

@@ -1,0 +1,99 @@
+"""Air that records hide, where the fit ends in another minimum: six positions, a sixth of one hides.
+
+Forces by an independent finite-element beam and Newton's method.
+"""
+
+import beam_fem
+import numpy as np
+import pytest
+
+from jaxtrachea.fitting.assessment import assess
+from jaxtrachea.fitting.build import build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.hidden_air import hidden_air
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.record_zeros import begins_flat
+from jaxtrachea.trachea.geometry import table_1
+
+pytestmark = pytest.mark.long
+
+TRUTH = {"EI_L": 300.0, "k_M": 0.5, "k_1": 1.2, "k_3": 0.08}
+PLACES, MARKED = (4.0, 8.0, 15.0, 35.0, 55.0, 75.0), (15.0, 35.0, 75.0)
+MARKERS = np.array([1, 3, 7])
+
+
+def press(s, depth):
+    """Force and deflection of the rings at depths, mm; 0 in air."""
+    x = np.asarray(table_1().ring_positions)
+    unit = beam_fem.solve(x, 160.0, [TRUTH["EI_L"]] * 16, [TRUTH["k_M"]] * 15, s, 1.0)
+    D, c = np.maximum(depth, 0.0), float(unit.w_C)
+    d = D.copy()
+    for _ in range(60):
+        F = TRUTH["k_1"] * d + TRUTH["k_3"] * d**3
+        d -= (d + c * F - D) / (1 + c * (TRUTH["k_1"] + 3 * TRUTH["k_3"] * d**2))
+    F = TRUTH["k_1"] * d + TRUTH["k_3"] * d**3
+    return F, F[:, None] * np.array(unit.w, float)
+
+
+def record(rng, name, s, air, offset, depth, noise, marked):
+    """51 samples from the end of the air on."""
+    way = np.linspace(-air, depth, 51)
+    force, rings = press(s, way)
+    seen = {}
+    if marked:
+        at = rings[:, MARKERS] + 0.003 * rng.normal(size=(51, 3))
+        seen = {"joint_rings": MARKERS, "joint_displacement": at}
+    force = force + offset + noise * rng.normal(size=51)
+    return Curve(name, f"s{s:g}", s, 0.0, way + air, force, **seen)
+
+
+CASES = {
+    # air, offset, depth, noise, markers; EI_L that came out before, "identifiable"
+    "two of six hide it": (0.5, 0.1, 1.5, 0.02, False),  # 15
+    "all hide it, still markers": (0.5, 0.0, 2.0, 0.06, True),  # k_1 0.16
+    "with offsets": (1.0, 0.2, 3.0, 0.05, False),  # k_1 0.39
+    "shallow": (0.27, 0.1, 0.9, 0.01, False),  # 13
+    "none": (0.0, 0.0, 2.0, 0.02, False),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_estimates_hold_the_truth(case):
+    *how, marked = CASES[case]
+    rng = np.random.default_rng(3)
+    places = MARKED if marked else PLACES
+    curves = [record(rng, "A", s, *how, marked) for s in places]
+    result = fit(build_study(curves, table_1()), Settings(starts=4))
+    names = [p.name for p, _, _ in result.study.unknowns[0]]
+    air = how[0]
+    for i, name in enumerate(names):
+        truth = {**TRUTH, "onset": air, "force_offset": how[1]}[name]
+        error = assess(result, 0, i).standard_error
+        off = np.log(result.value[0, i] / truth) if name in TRUTH else result.value[0, i] - truth
+        scale = error / result.value[0, i] if name in TRUTH else error
+        assert abs(off) < 3.5 * scale, (name, result.value[0, i])
+    assert names.count("onset") == (len(places) if air else 0)
+
+
+def test_a_press_without_air_does_not_begin_flat():
+    way = np.linspace(0.0, 2.0, 51)
+    rng = np.random.default_rng(0)
+    force = press(75.0, way)[0] + 0.001 * rng.normal(size=51)
+    assert not begins_flat(way, force)
+    still = np.concatenate([0.001 * rng.normal(size=20), force])
+    assert begins_flat(np.concatenate([np.linspace(-0.8, -0.04, 20), way]), still)
+
+
+def test_healthy_lanes_are_not_fitted_again():
+    rng = np.random.default_rng(5)
+    curves = [
+        record(rng, f"T{i}", s, 0.0, 0.0, 2.0, 0.02, False) for i in range(3) for s in PLACES
+    ]
+    study = build_study(curves, table_1())
+    result = fit(study.take(np.arange(3)), Settings(starts=2, verify=False))
+
+    def never(part):
+        raise AssertionError(f"{len(part.curves)} lanes fitted again")
+
+    assert not hidden_air(study, result, never).names
