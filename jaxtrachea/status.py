@@ -119,18 +119,23 @@ class PredictionStatus(_Described):
         3,
         "predicted, but nonlinear within the band: the delta-method band is inaccurate",
     )
-    EXTRAPOLATED = (
+    OTHER_ZERO = (
         4,
+        "predicted, but the record shows a zero that the fit holds at 0: its displacement or force "
+        "is counted from elsewhere",
+    )
+    EXTRAPOLATED = (
+        5,
         "predicted, but for a press unlike those of the fit, with values fixed that come from the "
         "factors of another tube: up to 30 % off, which the bands do not know",
     )
-    UNDETERMINED = 5, "predicted, but the data of the fit do not limit it: infinite bands"
-    TOO_DEEP = 6, "predicted, but where the wall moves further than the tube's radius"
-    NO_SOLUTION = 7, "no stable solution at some displacements"
-    NO_OWN = 8, "the curve's own parameters could not be fitted to it"
-    NO_ESTIMATE = 9, "the fit has no estimate for it"
-    UNKNOWN_SPECIMEN = 10, "the fit does not know this specimen"
-    BAD_DATA = 11, "the measurements could not be used"
+    UNDETERMINED = 6, "predicted, but the data of the fit do not limit it: infinite bands"
+    TOO_DEEP = 7, "predicted, but where the wall moves further than the tube's radius"
+    NO_SOLUTION = 8, "no stable solution at some displacements"
+    NO_OWN = 9, "the curve's own parameters could not be fitted to it"
+    NO_ESTIMATE = 10, "the fit has no estimate for it"
+    UNKNOWN_SPECIMEN = 11, "the fit does not know this specimen"
+    BAD_DATA = 12, "the measurements could not be used"
 
     @property
     def predicts(self) -> bool:

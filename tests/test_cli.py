@@ -99,7 +99,7 @@ BAD_SPECS = {
     "parameter unknown": (DATA + "[parameters]\nk_2 = {}", ["parameters.k_2: not a parameter"]),
     "parameter not in model": (
         DATA + "[parameters]\nGA_L = {}",
-        ["parameters.GA_L: not seen by this model", "EI_L"],
+        ["parameters.GA_L: not seen by this model; with shear = true in [model]", "EI_L"],
     ),
     "arch2": (DATA + '[model]\nrings = "arch2"', ["rings = 'arch2'", "k_M is the whole ring"]),
     "arch2 of sections": (

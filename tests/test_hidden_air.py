@@ -1,4 +1,4 @@
-"""Air that records hide, where the fit ends in another minimum: six positions, a sixth of one hides.
+"""Air that records hide, where the fit ends in another minimum: two of six, or all of them.
 
 Forces by an independent finite-element beam and Newton's method.
 """
@@ -87,9 +87,7 @@ def test_a_press_without_air_does_not_begin_flat():
 
 def test_healthy_lanes_are_not_fitted_again():
     rng = np.random.default_rng(5)
-    curves = [
-        record(rng, f"T{i}", s, 0.0, 0.0, 2.0, 0.02, False) for i in range(3) for s in PLACES
-    ]
+    curves = [record(rng, f"T{i}", s, 0.0, 0.0, 2.0, 0.02, False) for i in range(3) for s in PLACES]
     study = build_study(curves, table_1())
     result = fit(study.take(np.arange(3)), Settings(starts=2, verify=False))
 

@@ -1,5 +1,6 @@
 """From a fit specification to a study: opens the files, names what is wrong, builds the lanes."""
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 
@@ -44,13 +45,30 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
     known = visible(options, joints=joints)
     for name in spec.parameters:
         if name not in known:
-            reason = "not a parameter" if name not in DEFAULTS else "not seen by this model"
+            reason = "not a parameter" if name not in DEFAULTS else _unseen(name, options, joints)
             if name in OF_THE_ARCH:
                 reason = f"of a ring that bends; {OF_THE_ARCH[name]}"
             raise SpecError(f"parameters.{name}: {reason}; expected one of {', '.join(known)}")
     sections = {**spec.parameters, **_baseline(spec)}
     names = in_model(options, joints=joints, named=sections)
     return tuple(_parameter(defaults[n], sections.get(n)) for n in names)
+
+
+#: Keys of [model] that bring parameters along, and their values.
+_BRINGS = (
+    ("shear", True), ("skeleton", "softening"), ("local", "two-material"), ("coupling", "series"),
+    ("contact", "unilateral"), ("relaxation", "uniform"),
+)  # fmt: skip
+
+
+def _unseen(name: str, options: Options, joints: bool) -> str:
+    """That the model does not see a parameter, and with which key it would."""
+    for key, value in _BRINGS:
+        with contextlib.suppress(ValueError):
+            if name in visible(dataclasses.replace(options, **{key: value}), joints=joints):
+                written = str(value).lower() if isinstance(value, bool) else f'"{value}"'
+                return f"not seen by this model; with {key} = {written} in [model] it is"
+    return "not seen by this model"
 
 
 def _baseline(spec: FitSpec) -> Mapping[str, ParameterSection]:

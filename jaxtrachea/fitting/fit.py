@@ -28,7 +28,7 @@ from jaxtrachea.fitting.minima import (
 )
 from jaxtrachea.fitting.needs_review import needs_review, still_needs_review
 from jaxtrachea.fitting.noise import next_sigma, normal_psi2, precision_unit
-from jaxtrachea.fitting.omitted_zeros import Asked, asked_for, merged, near_estimates
+from jaxtrachea.fitting.omitted_zeros import asked_for, merged, near_estimates
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
@@ -109,23 +109,28 @@ def with_omitted_zeros(
     if study.recipe is None:
         return result
     quick = dataclasses.replace(settings, verify=False)
-    asked = hidden_air(
-        study, result, lambda part: _without_more_zeros(part, quick, alive, None, None)
-    )
-    rows = np.arange(result.lanes)  # who asked for nothing does not later
-    for _ in range(MORE_ZEROS):
-        asked = asked if asked.names else asked_for(result, rows)
-        if not asked.names:
+    rows = np.arange(result.lanes)
+    for turn in range(1 + MORE_ZEROS):
+        if turn:
+            asked = asked_for(result, rows)
+        else:
+            asked = hidden_air(
+                study, result, lambda part: _without_more_zeros(part, quick, alive, None, None)
+            )
+        if not asked.names and turn:
             break
+        if not asked.names:
+            continue
         study = with_zeros(study, asked.names)
         near = near_estimates(result, study, asked)
         _log.info("%d curves ask for an onset or an offset; fitted again", len(asked.names))
-        rows = np.flatnonzero([any(_key(c) in asked.names for c in lane) for lane in study.curves])
+        asking = [any(_key(c) in asked.names for c in lane) for lane in study.curves]
+        again = np.flatnonzero(asking)
         # As large as the data; who asks for them again has them computed again.
         vars(result).pop("residuals", None)
-        new = _without_more_zeros(study.take(rows), settings, alive, None, near[rows])
-        result = merged(study, result, rows, new)
-        asked = Asked({}, {})
+        new = _without_more_zeros(study.take(again), settings, alive, None, near[again])
+        result = merged(study, result, again, new)
+        rows = again if turn else rows  # who asked for nothing does not later
     return result
 
 

@@ -4,8 +4,10 @@ A record by itself cannot tell some air from a press whose law begins soft: it t
 Where that is wrong the whole specimen is: the other curves follow, and the fit ends in a minimum
 from which no small change asks for an onset (`omitted_zeros`). So a specimen whose residuals are
 larger than the noise of its records, and whose curves may begin in air, is fitted once more with
-the onsets of these curves. They are taken where the curves are then explained to their noise, and
-the likelihood gains more than so many unknowns do by chance.
+the onsets of these curves, and then with offsets, too. They are taken where the curves are then
+explained to their noise, the likelihood gains more than so many unknowns do by chance, and
+something beside the shape of these curves speaks for air, since a law that is missing from the
+model may look the same: the record of another curve that shows it, or markers that stand still.
 """
 
 from collections.abc import Callable
@@ -51,6 +53,8 @@ def hidden_air(study: Study, result: FitResult, fit: Callable[[Study], FitResult
     able = able_zeros(result)
     noise = _against_records(study, result)
     misses = noise.ratio > 1 + _MISSES * noise.error
+    shown = _shown(study)
+    misses &= shown | (result.samples > np.sum(study.lanes.precision > 0, axis=(1, 2)))
     lanes = np.flatnonzero(able[:, _ONSET].any(axis=1) & misses)
     flat = np.zeros(able.shape[::2], bool)
     for k in lanes.tolist():
@@ -69,7 +73,7 @@ def hidden_air(study: Study, result: FitResult, fit: Callable[[Study], FitResult
         }
         tried = fit(with_zeros(study, names, lanes))
         added = np.sum(taken[lanes], axis=(1, 2))
-        better = _better(study, result, lanes, tried, noise, added)
+        better = _better(study, result, lanes, tried, noise, added, shown[lanes])
         for row in np.flatnonzero(better).tolist():
             keys = [(c.specimen, c.trial) for c in study.curves[lanes[row]]]
             out.names.update({key: names[key] for key in keys if key in names})
@@ -93,6 +97,15 @@ def _against_records(study: Study, result: FitResult) -> Noise:
         return Noise(result.rms[:, 0] / np.sqrt(square / total), _SPREAD / np.sqrt(total))
 
 
+def _shown(study: Study) -> Bool[np.ndarray, " lanes"]:
+    """Lanes of which a record shows air."""
+    if study.record_zeros is None:
+        return np.zeros(len(study.curves), bool)
+    seen = study.lanes.precision > 0
+    first = np.min(np.where(seen, study.lanes.displacement, np.inf), axis=2)
+    return np.any(study.record_zeros[..., 0] > first, axis=1)
+
+
 def _begin_flat(study: Study, lane: int) -> Bool[np.ndarray, " T"]:
     """Curves of a lane that may begin in air."""
     out = np.zeros(study.lanes.s_c.shape[1], bool)
@@ -109,14 +122,17 @@ def _better(
     tried: FitResult,
     noise: Noise,
     added: Int[np.ndarray, " n"],
+    shown: Bool[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Lanes that are explained with `added` zeros, and gain enough by them."""
+    """Lanes that are explained with `added` zeros and gain enough, and whose air is `shown`."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = tried.rms / result.rms[lanes]
         explains = noise.ratio[lanes] * ratio[:, 0] < 1 + _EXPLAINS * noise.error[lanes]
         forces = np.sum(study.lanes.precision[lanes] > 0, axis=(1, 2))
         counts = np.stack([forces, result.samples[lanes] - forces], axis=1)
-        gain = -2 * np.nansum(counts * np.log(ratio), axis=1)
+        each = np.nan_to_num(-2 * counts * np.log(ratio))
+        gain = np.sum(each, axis=1)
     if study.noise_given[0]:
         gain = 2 * (result.cost[lanes] - tried.cost)
-    return tried.succeeded & explains & (gain > EVIDENCE + _EACH * added)
+    shown = shown | (each[:, 1] > EVIDENCE)
+    return tried.succeeded & explains & shown & (gain > EVIDENCE + _EACH * added)

@@ -10,8 +10,9 @@ from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.zeros import zeros_of
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.record_zeros import Zeros
 
+#: Units of what a press takes for itself.
+UNITS = {"onset": "mm", "force_offset": "N", "force_slope": "N/mm"}
 #: Curves named in a sentence; curves.csv holds all.
 _NAMES = 4
 
@@ -158,32 +159,38 @@ def _under_load(some: Sequence[FittedZeros], count: int) -> list[str]:
 
 def _held(study: Study) -> list[str]:
     """Zeros that the specification holds at 0 where records show another."""
+    curves = [c for lane in study.curves for c in lane]
+    said = []
+    for name, shown in zeros_against(study, curves).items():
+        against = np.flatnonzero(np.isfinite(shown))
+        if len(against):
+            k = int(against[0])
+            others = f" (and so do {len(against) - 1} others)" if len(against) > 1 else ""
+            said.append(
+                f"{name} is held at 0, where the record of {curves[k].specimen} {curves[k].trial} "
+                f"shows {shown[k]:.3g} {UNITS[name]}{others}: leave parameters.{name} out"
+            )
+    return said
+
+
+def zeros_against(study: Study, curves: Sequence[Curve]) -> dict[str, Float[np.ndarray, " C"]]:
+    """What curves of the rig show of zeros that a study holds at 0, by name; NaN: nothing.
+
+    Args:
+        study: whose table it is.
+        curves: of the study, or measured later.
+    """
     if study.model.options.contact != "unilateral":
-        return []
+        return {}
     held = [
         p.name for p in study.parameters
         if p.name in OF_THE_PRESS and p.fixed and not p.auto and p.value == 0
     ]  # fmt: skip
     if not held:
-        return []
-    curves = [c for lane in study.curves for c in lane]
+        return {}
     zeros = zeros_of(curves)
-    return [text for name in held for text in _against(name, curves, zeros)]
-
-
-def _against(name: str, curves: Sequence[Curve], zeros: Zeros) -> list[str]:
-    against = np.flatnonzero(getattr(zeros, name) & (zeros.air > 1))
-    if not len(against):
-        return []
-    k = int(against[0])
-    value, unit = (zeros.touch, "mm") if name == "onset" else (zeros.offset, "N")
-    if name == "force_slope":
-        value, unit = zeros.slope, "N/mm"
-    others = f" (and so do {len(against) - 1} others)" if len(against) > 1 else ""
-    return [
-        f"{name} is held at 0, where the record of {curves[k].specimen} {curves[k].trial} shows "
-        f"{value[k]:.3g} {unit}{others}: leave parameters.{name} out"
-    ]
+    value = {"onset": zeros.touch, "force_offset": zeros.offset, "force_slope": zeros.slope}
+    return {n: np.where(getattr(zeros, n) & (zeros.air > 1), value[n], np.nan) for n in held}
 
 
 def cells(study: Study) -> dict[tuple[str, str], dict[str, object]]:

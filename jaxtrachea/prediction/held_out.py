@@ -19,6 +19,7 @@ from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.zero_messages import UNITS, zeros_against
 from jaxtrachea.fitting.zeros import resolved
 from jaxtrachea.measurements.observed import WITHOUT_VECTORS
 from jaxtrachea.measurements.read import BadCurve, Curve
@@ -147,8 +148,30 @@ def compare(
     depths = [c.displacement for c in curves]
     times = [np.asarray(c.time) for c in curves] if stored.study.model.relaxes else None
     found = predict_sources(stored, sources, s, depths, sigmas, aside=aside, times=times)
+    found = _with_other_zeros(fitted.study, curves, words, found)
     offsets = [value_of(stored, source, "force_offset") for source in sources]
     return [Compared(*row) for row in zip(curves, found, words, offsets, strict=True)]
+
+
+def _with_other_zeros(
+    study: Study, curves: Sequence[Curve], words: Sequence[str], found: list[CurvePrediction]
+) -> list[CurvePrediction]:
+    """The predictions; of records that show what the fit holds at 0 with that word."""
+    against, out = zeros_against(study, curves), []
+    for k, (word, p) in enumerate(zip(words, found, strict=True)):
+        said = [
+            f"{name} is held at 0 in the fit, where this record shows {shown[k]:.3g} {UNITS[name]}"
+            for name, shown in against.items()
+            if word != "yes" and np.isfinite(shown[k])
+        ]
+        if said and p.status.predicts:
+            status = max(p.status, PredictionStatus.OTHER_ZERO)
+            head = p.message.removeprefix(p.status.message)
+            p = dataclasses.replace(
+                p, status=status, message="; ".join([f"{status.message}{head}", *said])
+            )
+        out.append(p)
+    return out
 
 
 def _with_zeros(stored: FitResult, curves: Sequence[Curve]) -> tuple[FitResult, Taken]:

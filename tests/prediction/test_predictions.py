@@ -375,3 +375,20 @@ def test_curves_deeper_than_a_skeleton_was_tested(options, depths, says):
     curves = [Curve("a", "", 50.0, 0.0, d * np.linspace(0, 1, 5), np.ones(5)) for d in depths]
     sentence = deeper_than_validated(curves, options, 12.0)
     assert sentence is None if says is None else re.search(says, sentence)
+
+
+def test_a_record_with_air_is_not_ok_where_the_fit_holds_the_onset(read):
+    """Its displacement counts from elsewhere: 0.6 mm of air, as the fit would have named it."""
+    rng = np.random.default_rng(4)
+    way = np.linspace(0.0, 4.0, 80)
+    depth = np.maximum(way - 0.6, 0)
+    force = np.where(depth > 0, true_force(75.0, np.maximum(depth, 1e-9)), 0.0)
+    curves = [
+        Curve("s0003", name, 75.0, 0.0, D, F + 0.01 * rng.normal(size=80))
+        for name, D, F in (("air", way, force), ("none", way, true_force(75.0, way + 1e-9)))
+    ]
+    air, none = (c.prediction for c in held_out.compare(read, curves))
+    assert air.status == PredictionStatus.OTHER_ZERO
+    shown = air.message.split("onset is held at 0 in the fit, where this record shows ")[1]
+    assert abs(float(shown.split()[0]) - 0.6) < 0.03
+    assert none.status == PredictionStatus.OK

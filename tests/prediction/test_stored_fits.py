@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -10,6 +11,7 @@ from noisy_fits import DEPTHS
 
 import jaxtrachea
 from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.results.hdf5 import SCHEMA, VERSION
 
 
 def assert_same(mine, its, where=""):
@@ -120,3 +122,8 @@ def test_results_that_cannot_be_read(harm, says, study, tmp_path):
     harm(tmp_path / "r")
     with pytest.raises(jaxtrachea.NoResults, match=says):
         jaxtrachea.read_results(tmp_path / "r")
+
+
+def test_the_page_names_the_version_that_is_written():
+    page = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
+    assert f"`{SCHEMA}`, version {VERSION}" in page
