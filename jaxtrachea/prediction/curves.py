@@ -28,7 +28,7 @@ from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Estimate, Predicted, Values, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
 from jaxtrachea.prediction.pressed import pressed
-from jaxtrachea.prediction.profile import error_of_ends, has_profile
+from jaxtrachea.prediction.profile import BENT, errors_of_bands
 from jaxtrachea.prediction.sources import (
     CurveParameters,
     detection_limit,
@@ -41,8 +41,6 @@ from jaxtrachea.status import PredictionStatus, PressStatus
 AT_CONTACT = ("contact", "time", "press")
 #: What a prediction has fields of its own for.
 OWN = ("force", "joints", "reactions")
-#: Error of the linear band at its ends, in half-widths, from which it is called bent.
-BENT = 0.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -190,12 +188,12 @@ def predict_sources(
     def answers(rows, free) -> Any:
         """`Predicted` of curves, numpy, their free parameters given; one row each."""
         out = None
-        for members in (np.isnan(blend[rows]), ~np.isnan(blend[rows])):
-            members = np.flatnonzero(members)
-            # A rounded corner is another program; mostly all curves have one, or none.
-            rounded = not np.isnan(blend[rows[members]]).all()
+        # A rounded corner is another program; mostly all curves have one, or none.
+        for rounded in (False, True):
+            alike = np.isnan(blend) != rounded
+            members = np.flatnonzero(alike[rows])
             arrays = estimates, motion._replace(blend=blend if rounded else None), slack
-            size = min(batch, _rounded(max(len(members), 1), 8))
+            size = min(batch, _rounded(max(int(alike.sum()), 1), 8))
             for first in range(0, len(members), size):
                 at = members[first : first + size]
                 full = np.pad(at, (0, size - len(at)), mode="edge")
@@ -210,7 +208,7 @@ def predict_sources(
 
     every = answers(np.arange(len(sources)), estimates.free)
     parts = [jax.tree.map(lambda v, k=k: v[k], every) for k in range(len(sources))]
-    bends = _bends(stored, sources, displacements, parts, errors, answers)
+    bends = errors_of_bands(stored, sources, displacements, parts, errors, answers)
     out = []
     for k, (source, part, bend) in enumerate(zip(sources, parts, bends, strict=True)):
         sigma = None if sigmas is None else sigmas[k]
@@ -349,74 +347,6 @@ def _marker_sigma(stored: FitResult, source: CurveParameters, displacement) -> n
         return np.full(len(displacement), source.sigma[1])
     depth = depths(displacement, onset_of(stored, source), stored.study.model.options)
     return 1 / Noise(joints=given[0], joints_share=given[1]).joints_precision(depth)
-
-
-def _bends(
-    stored: FitResult, sources, displacements, parts: list[Predicted], errors, answers
-) -> np.ndarray:
-    """Error of each linear band at its ends, at the deepest displacement, in half-widths.
-
-    By a straight walk along the covariance of the estimates, and where that says that it is bent
-    by the profile of the force, which takes longer. What the curve's own parameters take up does
-    not count: they are fitted to it.
-    """
-    bends = np.zeros(len(sources))
-    slopes, doubts = {}, []
-    for k, (source, part) in enumerate(zip(sources, parts, strict=True)):
-        n, deepest = len(displacements[k]), int(part.deepest)
-        half = float(source.half_width * part.se["force"][deepest])
-        if not (np.isfinite(half) and half > 0 and np.isfinite(part.value["force"][deepest])):
-            continue
-        worst = np.max(np.abs(_without_own(source, part.bend[:, :n])[:, deepest])) / half
-        # No solution within the band (past a fold): as bent as can be.
-        bends[k] = worst if np.isfinite(worst) else np.inf
-        slopes[k] = _without_own(source, part.slope[:, :n])[:, deepest]
-        if bends[k] > BENT and slopes[k] @ source.covariance @ slopes[k] > 0:
-            doubts.append(k)
-    if not (doubts and has_profile(stored)):
-        return bends
-    rows = np.repeat(doubts, 2)
-    columns = [_unknowns_of(stored, sources[k]) for k in rows]
-
-    def force(moved):
-        free = np.stack(
-            [sources[k].free + M @ by for k, M, by in zip(rows, columns, moved, strict=True)]
-        )
-        part, changes, by_unknowns = answers(rows, free), [], []
-        for i, k in enumerate(rows):
-            n, deepest = len(displacements[k]), int(part.deepest[i])
-            change = part.value["force"][i, :n] - parts[k].value["force"][:n]
-            changes.append(_without_own(sources[k], change)[deepest])
-            slope = _without_own(sources[k], part.slope[i, :, :n])[:, deepest]
-            by_unknowns.append(columns[i].T @ slope)
-        return np.array(changes), np.stack(by_unknowns)
-
-    lanes = np.array([sources[k].lane for k in rows])
-    growth = np.array([errors[lane].growth for lane in lanes])
-    half = np.array([sources[k].half_width for k in rows])
-    pulls = np.array([slopes[k] @ sources[k].covariance @ slopes[k] for k in rows])
-    target = np.tile([1.0, -1.0], len(doubts)) * half * np.sqrt(pulls)
-    expected = (half * np.where(np.isfinite(growth), growth, 1.0)) ** 2
-    found = error_of_ends(stored, lanes, force, target, expected)
-    worst = np.max(found.reshape(-1, 2), axis=1)  # NaN stays
-    bends[doubts] = np.where(np.isnan(worst), bends[doubts], worst)
-    return bends
-
-
-def _without_own(source: CurveParameters, change: Any) -> np.ndarray:
-    """A change of the force, (..., N), less what the curve's own parameters take up of it."""
-    if source.refitted_own is None:
-        return change
-    slope, gain = source.refitted_own
-    return change - (change @ gain.T) @ slope.T
-
-
-def _unknowns_of(stored: FitResult, source: CurveParameters) -> np.ndarray:
-    """Derivative of the free columns of a curve by the unknowns of its lane; (F, P)."""
-    out = np.zeros((len(source.free), stored.theta.shape[1]))
-    known = np.flatnonzero(source.index >= 0)
-    out[known, source.index[known]] = 1
-    return out
 
 
 def _beyond(spans: np.ndarray, s: float, depth: np.ndarray, aside=(), counted: str = "") -> str:

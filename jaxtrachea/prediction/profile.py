@@ -7,15 +7,20 @@ predictions of dynamic models, doi:10.1186/1752-0509-6-120). A straight walk fro
 along their covariance leaves the valley of the fit where that is curved, and says nothing of it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.prediction.model_error import over_unknowns, weighted_rows
+from jaxtrachea.prediction.core import Predicted
+from jaxtrachea.prediction.model_error import ModelError, over_unknowns, weighted_rows
+from jaxtrachea.prediction.sources import CurveParameters
 
+#: Error of the linear band at its ends, in half-widths, from which it is called bent.
+BENT = 0.5
 #: Steps of the way to the end of a band, and of the constrained fit in all.
 WAY, STEPS = 20, 40
 #: Change of its cost, over that of the band's end, and distance from its force, over the
@@ -29,12 +34,93 @@ _SINGULAR = 1e-8
 Force = Callable[[Float[np.ndarray, "n P"]], tuple[np.ndarray, np.ndarray]]
 
 
-def has_profile(stored: FitResult) -> bool:
+def errors_of_bands(
+    stored: FitResult,
+    sources: Sequence[CurveParameters],
+    displacements: Sequence[np.ndarray],
+    parts: Sequence[Predicted],
+    errors: Mapping[int, ModelError],
+    answers: Callable[[np.ndarray, np.ndarray], Predicted],
+) -> Float[np.ndarray, " curves"]:
+    """Error of each linear band at its ends, at the deepest displacement, in half-widths.
+
+    By a straight walk along the covariance of the estimates, and where that says that it is bent
+    by the profile of the force, which takes longer. What the curve's own parameters take up does
+    not count: they are fitted to it.
+
+    Args:
+        stored: the fit.
+        sources: of each curve, with covariances as its band has them.
+        displacements: of each, mm.
+        parts: what is predicted of each.
+        errors: of the model, by lane.
+        answers: what is predicted of some curves with other free parameters, a row each.
+    """
+    bends = np.zeros(len(sources))
+    slopes, doubts = {}, []
+    for k, (source, part) in enumerate(zip(sources, parts, strict=True)):
+        n, deepest = len(displacements[k]), int(part.deepest)
+        half = float(source.half_width * part.se["force"][deepest])
+        if not (np.isfinite(half) and half > 0 and np.isfinite(part.value["force"][deepest])):
+            continue
+        worst = np.max(np.abs(_without_own(source, part.bend[:, :n])[:, deepest])) / half
+        # No solution within the band (past a fold): as bent as can be.
+        bends[k] = worst if np.isfinite(worst) else np.inf
+        slopes[k] = _without_own(source, part.slope[:, :n])[:, deepest]
+        if bends[k] > BENT and slopes[k] @ source.covariance @ slopes[k] > 0:
+            doubts.append(k)
+    if not (doubts and _has_profile(stored)):
+        return bends
+    rows = np.repeat(doubts, 2)
+    columns = [_unknowns_of(stored, sources[k]) for k in rows]
+
+    def force(moved):
+        free = np.stack(
+            [sources[k].free + M @ by for k, M, by in zip(rows, columns, moved, strict=True)]
+        )
+        part, changes, by_unknowns = answers(rows, free), [], []
+        for i, k in enumerate(rows):
+            n, deepest = len(displacements[k]), int(part.deepest[i])
+            change = part.value["force"][i, :n] - parts[k].value["force"][:n]
+            changes.append(_without_own(sources[k], change)[deepest])
+            slope = _without_own(sources[k], part.slope[i, :, :n])[:, deepest]
+            by_unknowns.append(columns[i].T @ slope)
+        return np.array(changes), np.stack(by_unknowns)
+
+    lanes = np.array([sources[k].lane for k in rows])
+    growth = np.array([errors[lane].growth for lane in lanes])
+    half = np.array([sources[k].half_width for k in rows])
+    pulls = np.array([slopes[k] @ sources[k].covariance @ slopes[k] for k in rows])
+    target = np.tile([1.0, -1.0], len(doubts)) * half * np.sqrt(pulls)
+    expected = (half * np.where(np.isfinite(growth), growth, 1.0)) ** 2
+    found = _error_of_ends(stored, lanes, force, target, expected)
+    worst = np.max(found.reshape(-1, 2), axis=1)  # NaN stays
+    bends[doubts] = np.where(np.isnan(worst), bends[doubts], worst)
+    return bends
+
+
+def _without_own(source: CurveParameters, change: Any) -> np.ndarray:
+    """A change of the force, (..., N), less what the curve's own parameters take up of it."""
+    if source.refitted_own is None:
+        return change
+    slope, gain = source.refitted_own
+    return change - (change @ gain.T) @ slope.T
+
+
+def _unknowns_of(stored: FitResult, source: CurveParameters) -> np.ndarray:
+    """Derivative of the free columns of a curve by the unknowns of its lane; (F, P)."""
+    out = np.zeros((len(source.free), stored.theta.shape[1]))
+    known = np.flatnonzero(source.index >= 0)
+    out[known, source.index[known]] = 1
+    return out
+
+
+def _has_profile(stored: FitResult) -> bool:
     """Whether the cost of one lane is the sum of squares that its standard errors are of."""
     return not stored.study.joint and stored.study.model.loss == "linear"
 
 
-def error_of_ends(
+def _error_of_ends(
     stored: FitResult,
     lanes: np.ndarray,
     force: Force,

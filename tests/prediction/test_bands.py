@@ -180,7 +180,7 @@ def test_bent_is_what_the_profile_of_the_force_says(tmp_path, monkeypatch):
         ends = p.force[-1] + np.array([1, -1]) * p.half_width * p.se[-1]
         rises = np.array([rise_at(read, lane, 75.0, end) for end in ends])
         assert np.max(np.abs(half / np.sqrt(rises) - 1)) < 0.5
-    monkeypatch.setattr("jaxtrachea.prediction.curves.has_profile", lambda _: False)
+    monkeypatch.setattr("jaxtrachea.prediction.profile._has_profile", lambda _: False)
     _, straight = statuses()
     assert np.sum(straight) >= 8
     assert np.sum(bent) <= 4
