@@ -268,11 +268,12 @@ def _verified(result, minima: Minima, known: Structure, settings, progress) -> F
         evidence, better = verify_minimum(
             result, minima, doubts, settings, known, progress, last=not turns_left
         )
-        left = np.isfinite(better).all(axis=1) & bool(turns_left)
+        rows = np.flatnonzero(np.isfinite(better).all(axis=1) & bool(turns_left))
+        left[:] = False
+        left[rows] = True
         settled = doubts.any(axis=1) & ~left
         for all_, new in zip(final, evidence, strict=True):
             all_[settled] = new[settled]
-        rows = np.flatnonzero(left)
         if not len(rows):
             break
         # As many as the fit computes together: the same program.

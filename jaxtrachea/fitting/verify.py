@@ -118,7 +118,7 @@ def verify_minimum(
     present = (result.study.lanes.active > 0) & ~result.undetermined
     doubts = doubts | (present & (evidence.minima > 1)[:, None])
     if not last:  # a lane with a better minimum is looked at again
-        doubts = doubts & np.isnan(region.better).all(axis=1)[:, None]
+        doubts = doubts & np.isnan(region.better).all(axis=1, keepdims=True)
         if not doubts.any():
             return evidence, region.better
     region.sides = _sides(result, settings, doubts, alive)
