@@ -275,6 +275,28 @@ def test_no_doubt_costs_nothing(study, monkeypatch):
     assert [assess(usual, 0, i).verdict for i in range(4)] == ["identifiable"] * 4
 
 
+@pytest.mark.long
+def test_each_lane_is_profiled_once(study, monkeypatch):
+    """Where one has a better minimum the others are profiled at once; it is, when it has moved."""
+    lanes, profiled = study.take(np.full(3, 5)), []
+
+    def other_minima(region, rows, known):
+        if not profiled:
+            region.better[0] = region.result.theta[0]
+        return np.ones(len(rows), int)
+
+    def profile(region, evidence):
+        profiled.append(sorted(set(region.sides.lane.tolist())))
+        evidence.evidence_low[profiled[-1]] = len(profiled)
+
+    monkeypatch.setattr(verify, "_other_minima", other_minima)
+    monkeypatch.setattr(verify, "_profiled", profile)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.needs_review", lambda r, _: r.value > 0)
+    result = fit(lanes, Settings(starts=1))
+    assert profiled == [[1, 2], [0]]
+    np.testing.assert_array_equal(result.evidence_low, np.tile([[2.0], [1.0], [1.0]], 4))
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_truth_table():

@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.curve_noise import weighed_by_curve
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, markers
 from jaxtrachea.fitting.lanes import (
     Noise,
     Taken,
@@ -159,6 +159,17 @@ def without_zeros(study: Study) -> Study:
         study, model=model, parameters=parameters, lanes=lanes, change_points=seen,
         record_zeros=None,
     )  # fmt: skip
+
+
+def without_markers(study: Study) -> Study:
+    """A study of lanes that have no markers, without the arrays of them.
+
+    Args:
+        study: lanes of one in which others have some.
+    """
+    of_rings = {kind.name for kind in markers(study.lanes)}
+    others = {name: v for name, v in study.lanes.others.items() if name not in of_rings}
+    return dataclasses.replace(study, lanes=study.lanes._replace(others=others))
 
 
 def with_recipe(study: Study, **changes: Any) -> Study:

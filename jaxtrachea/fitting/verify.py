@@ -104,7 +104,7 @@ def verify_minimum(
 
     Returns:
         The evidence, and a better minimum of each lane where one was found, NaN elsewhere: then
-        the evidence is not about the right estimate.
+        the evidence of this lane is not about the right estimate, and may be missing.
     """
     lanes = np.flatnonzero(doubts.any(axis=1))
     alive = None if progress is None else lambda *_: progress(0, 0)
@@ -113,12 +113,14 @@ def verify_minimum(
     lane, end = minima.lane[of_lanes], minima.end[of_lanes]
     region.add(lane, end, region.sides.costs(lane, end))
     several = _other_minima(region, lanes, known)
-    evidence = _unseen(result)
+    evidence = no_evidence(result)
     evidence.minima[lanes] = several
-    if np.isfinite(region.better).any() and not last:
-        return evidence, region.better
     present = (result.study.lanes.active > 0) & ~result.undetermined
     doubts = doubts | (present & (evidence.minima > 1)[:, None])
+    if not last:  # a lane with a better minimum is looked at again
+        doubts = doubts & np.isnan(region.better).all(axis=1, keepdims=True)
+        if not doubts.any():
+            return evidence, region.better
     region.sides = _sides(result, settings, doubts, alive)
     _profiled(region, evidence)
     settled = (result.status > FitStatus.UNIDENTIFIABLE) & doubts.any(axis=1)
@@ -132,8 +134,8 @@ def _sides(result: FitResult, settings: Settings, doubts, progress) -> Sides:
     return Sides(result, settings, lane, unknown, progress, accuracy=ACCURACY, rounds=ROUNDS)
 
 
-def _unseen(result: FitResult) -> Evidence:
-    """No evidence yet."""
+def no_evidence(result: FitResult) -> Evidence:
+    """No evidence yet: the statuses of the fit, one minimum of each lane."""
     none = np.full(result.theta.shape, np.nan)
     end = np.full((*none.shape, 2), -1)
     return Evidence(result.status.copy(), none, none.copy(), end, np.ones(result.lanes, int))
