@@ -115,13 +115,13 @@ def with_zeros(study: Study, asked: Taken, lanes: Int[np.ndarray, " n"] | None =
     """
     recipe = study.recipe
     assert recipe is not None
+    every = {k: {*recipe.asked.get(k, ()), *asked.get(k, ())} for k in {*recipe.asked, *asked}}
     if lanes is not None:
         of = np.repeat(np.arange(len(study.curves)), [len(lane) for lane in study.curves])
         rows = np.concatenate([np.flatnonzero(of == k) for k in lanes])
         zeros = recipe.zeros and Zeros(*(v[rows] for v in recipe.zeros))
-        recipe = dataclasses.replace(recipe, asked=asked, zeros=zeros)
+        recipe = dataclasses.replace(recipe, asked=every, zeros=zeros)
         return _built([c for k in lanes for c in study.curves[k]], recipe)
-    every = {k: {*recipe.asked.get(k, ()), *asked.get(k, ())} for k in {*recipe.asked, *asked}}
     curves = [c for lane in study.curves for c in lane]
     again = _built(curves, dataclasses.replace(recipe, asked=every), study)
     return with_recipe(again, holdout_groups=study.holdout_groups)

@@ -68,10 +68,11 @@ def fit(
     (`structure`), one of them is held, so that there is no valley to follow; where an estimate
     gives cause for doubt, other minima are looked for and unknowns are profiled (`verify`). A
     lane that gives no cause costs nothing more. Where the residuals ask for an `auto` onset or
-    offset that the record of a curve does not show (`omitted_zeros`), its lane is fitted again
-    with it, and the study of the result has it. Where the noise of forces has a share of the force
-    to be found (`Noise.force_share`), the fit is made in turns with it; the study of the result
-    keeps what was found, and refits from it do, too. Each stage is logged (`logging`, level INFO).
+    offset that the record of a curve does not show (`omitted_zeros`, `hidden_air`), its lane is
+    fitted again with it, and the study of the result has it. Where the noise of forces has a share
+    of the force to be found (`Noise.force_share`), the fit is made in turns with it; the study of
+    the result keeps what was found, and refits from it do, too. Each stage is logged (`logging`,
+    level INFO).
 
     Args:
         study: from `build.build_study`.

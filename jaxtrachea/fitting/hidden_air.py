@@ -2,15 +2,16 @@
 
 A record by itself cannot tell some air from a press whose law begins soft: it then takes no onset.
 Where that is wrong the whole specimen is: the other curves follow, and the fit ends in a minimum
-from which no small change asks for an onset (`omitted_zeros`). So a specimen whose residuals are
-larger than the noise of its records, and whose curves may begin in air, is fitted once more with
-the onsets of these curves, and then with offsets, too. They are taken where the curves are then
-explained to their noise, the likelihood gains more than so many unknowns do by chance, and
-something beside the shape of these curves speaks for air, since a law that is missing from the
-model may look the same: the record of another curve that shows it, or markers that stand still.
+from which no small change asks for an onset (`omitted_zeros`). So a specimen is
+fitted once more with the onsets of its curves that may begin in air, and then with offsets, too,
+where its residuals are larger than the noise of its records and something speaks for air: two other
+records show it, and the fit has moved an onset away from there, or it has markers, which stand
+still in air. A law that is missing from the model may look the same otherwise. The onsets are
+taken where the curves are then explained to their noise, the likelihood gains more than so many
+unknowns do by chance, and these witnesses agree.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,8 @@ from jaxtrachea.fitting.build import with_zeros
 from jaxtrachea.fitting.omitted_zeros import ZEROS, Asked, able_zeros
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.measurements.record_zeros import EVIDENCE, begins_flat
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.record_zeros import EVIDENCE, flat_until
 
 #: Relative error of the noise of n samples, as a record tells it, times sqrt(n).
 _SPREAD = 1.2
@@ -29,6 +31,9 @@ _SPREAD = 1.2
 _MISSES, _EXPLAINS = 2.0, 3.0
 #: Gain in -2 ln L of each further zero beside `EVIDENCE`.
 _EACH = 4.0
+#: Records of a specimen that must show air, share of it by which their onsets may move, and
+#: standard deviations of markers that stand still.
+_WITNESSES, _STAYS, _STILL = 2, 0.15, 2.0
 _ONSET = ZEROS.index("onset")
 
 
@@ -53,14 +58,18 @@ def hidden_air(study: Study, result: FitResult, fit: Callable[[Study], FitResult
     able = able_zeros(result)
     noise = _against_records(study, result)
     misses = noise.ratio > 1 + _MISSES * noise.error
-    shown = _shown(study)
-    misses &= shown | (result.samples > np.sum(study.lanes.precision > 0, axis=(1, 2)))
+    marked = result.samples > np.sum(study.lanes.precision > 0, axis=(1, 2))
     lanes = np.flatnonzero(able[:, _ONSET].any(axis=1) & misses)
-    flat = np.zeros(able.shape[::2], bool)
+    stay = {k: _stay(study, k, _onsets(result, k)) for k in lanes.tolist()}
+    moved = [k for k, v in stay.items() if False in v and len(v) >= _WITNESSES]
+    lanes = lanes[marked[lanes] | np.isin(lanes, moved)]
+    ends = np.full(able.shape[::2], np.nan)
     for k in lanes.tolist():
-        flat[k] = able[k, _ONSET] & _begin_flat(study, k)
-    able &= flat[:, None]
-    lanes = lanes[flat[lanes].any(axis=1)]
+        for t, c in enumerate(study.curves[k]):
+            if able[k, _ONSET, t]:
+                ends[k, t] = flat_until(c.rising.displacement, c.rising.force)
+    able &= np.isfinite(ends)[:, None]
+    lanes = lanes[np.isfinite(ends[lanes]).any(axis=1)]
     for zeros in (ZEROS[:1], ZEROS):  # an offset, too, where an onset alone does not explain it
         if not len(lanes):
             break
@@ -73,7 +82,9 @@ def hidden_air(study: Study, result: FitResult, fit: Callable[[Study], FitResult
         }
         tried = fit(with_zeros(study, names, lanes))
         added = np.sum(taken[lanes], axis=(1, 2))
-        better = _better(study, result, lanes, tried, noise, added, shown[lanes])
+        better = _better(study, result, lanes, tried, noise, added)
+        for row in np.flatnonzero(better).tolist():
+            better[row] = _is_air(study, int(lanes[row]), ends[lanes[row]], tried, row)
         for row in np.flatnonzero(better).tolist():
             keys = [(c.specimen, c.trial) for c in study.curves[lanes[row]]]
             out.names.update({key: names[key] for key in keys if key in names})
@@ -97,22 +108,57 @@ def _against_records(study: Study, result: FitResult) -> Noise:
         return Noise(result.rms[:, 0] / np.sqrt(square / total), _SPREAD / np.sqrt(total))
 
 
-def _shown(study: Study) -> Bool[np.ndarray, " lanes"]:
-    """Lanes of which a record shows air."""
-    if study.record_zeros is None:
-        return np.zeros(len(study.curves), bool)
-    seen = study.lanes.precision > 0
-    first = np.min(np.where(seen, study.lanes.displacement, np.inf), axis=2)
-    return np.any(study.record_zeros[..., 0] > first, axis=1)
+def _onsets(result: FitResult, lane: int) -> dict[str, float]:
+    """Onsets that curves of a lane have taken, by trial, mm."""
+    rows = zip(result.study.unknowns[lane], result.value[lane].tolist(), strict=False)
+    return {trial: value for (p, _, trial), value in rows if p.name == "onset"}
 
 
-def _begin_flat(study: Study, lane: int) -> Bool[np.ndarray, " T"]:
-    """Curves of a lane that may begin in air."""
-    out = np.zeros(study.lanes.s_c.shape[1], bool)
-    for t, c in enumerate(study.curves[lane]):
-        rising = c.rising
-        out[t] = begins_flat(np.asarray(rising.displacement), np.asarray(rising.force))
+def _stay(study: Study, lane: int, onset: Mapping[str, float]) -> list[bool]:
+    """Of records of a lane that show air: whether these onsets are where they show them."""
+    out = []
+    for t, c in enumerate(study.curves[lane] if study.record_zeros is not None else ()):
+        D = c.rising.displacement
+        first, step = float(np.min(D)), float(np.ptp(D)) / (len(D) - 1)
+        assert study.record_zeros is not None
+        shown = float(study.record_zeros[lane, t, 0])
+        if shown > first:
+            off = abs(onset.get(c.trial, first) - shown)
+            out.append(off <= _STAYS * (shown - first) + step)
     return out
+
+
+def _is_air(
+    study: Study, lane: int, ends: Float[np.ndarray, " T"], tried: FitResult, row: int
+) -> bool:
+    """Whether onsets of a lane, tried in `row`, are what its witnesses say.
+
+    An onset that is added lies between the first sample and the end of its flat beginning (`ends`,
+    NaN: not added). Those that records show are back where these show them: where all move
+    together, they stand for a law that is missing. Without such records markers stand still in all
+    of the air.
+    """
+    onset = _onsets(tried, row)
+    for c, end in zip(study.curves[lane], ends.tolist(), strict=False):
+        D = c.rising.displacement
+        step = float(np.ptp(D)) / (len(D) - 1)
+        if np.isfinite(end) and not float(np.min(D)) < onset[c.trial] <= end + step:
+            return False
+    stay = _stay(study, lane, onset)
+    if len(stay) >= _WITNESSES:
+        return all(stay)
+    return _markers_stand_still(study.curves[lane], onset, float(tried.rms[row, 1]))
+
+
+def _markers_stand_still(curves: Sequence[Curve], onset: Mapping[str, float], noise: float) -> bool:
+    """Whether markers do not move before the onsets, by more than twice their residuals."""
+    still = []
+    for c in curves:
+        if c.joint_displacement is not None and c.trial in onset:
+            before = c.joint_displacement[c.displacement < onset[c.trial]]
+            seen = np.isfinite(before).any()
+            still.append(float(np.sqrt(np.nanmean(before**2))) if seen else np.inf)
+    return bool(still) and max(still) < _STILL * noise
 
 
 def _better(
@@ -122,17 +168,14 @@ def _better(
     tried: FitResult,
     noise: Noise,
     added: Int[np.ndarray, " n"],
-    shown: Bool[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " n"]:
-    """Lanes that are explained with `added` zeros and gain enough, and whose air is `shown`."""
+    """Lanes that are explained with `added` zeros, and gain enough by them."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = tried.rms / result.rms[lanes]
         explains = noise.ratio[lanes] * ratio[:, 0] < 1 + _EXPLAINS * noise.error[lanes]
         forces = np.sum(study.lanes.precision[lanes] > 0, axis=(1, 2))
         counts = np.stack([forces, result.samples[lanes] - forces], axis=1)
-        each = np.nan_to_num(-2 * counts * np.log(ratio))
-        gain = np.sum(each, axis=1)
+        gain = -2 * np.nansum(counts * np.log(ratio), axis=1)
     if study.noise_given[0]:
         gain = 2 * (result.cost[lanes] - tried.cost)
-    shown = shown | (each[:, 1] > EVIDENCE)
-    return tried.succeeded & explains & shown & (gain > EVIDENCE + _EACH * added)
+    return tried.succeeded & explains & (gain > EVIDENCE + _EACH * added)

@@ -11,8 +11,8 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.zeros import zeros_of
 from jaxtrachea.measurements.curve import Curve
 
-#: Units of what a press takes for itself.
-UNITS = {"onset": "mm", "force_offset": "N", "force_slope": "N/mm"}
+#: Units of zeros that a table may hold at 0; a line that is held there is in no table.
+UNITS = {"onset": "mm", "force_offset": "N"}
 #: Curves named in a sentence; curves.csv holds all.
 _NAMES = 4
 
@@ -107,7 +107,7 @@ def asked_by_fits(study: Study, value: Float[np.ndarray, "lanes P"]) -> list[Fit
 def sentences_of_fits(study: Study, value: Float[np.ndarray, "lanes P"]) -> list[str]:
     """What curves take because their fits ask for it; arguments as for `asked_by_fits`."""
     every, count = asked_by_fits(study, value), sum(map(len, study.curves))
-    why = " (its record alone shows none, its residuals ask for one)"
+    why = " (its record alone shows none, the fit is not explained without)"
     out = []
     for name, unit in (("onset", "mm"), ("force_offset", "N")):
         some = [s for s in every if not np.isnan(getattr(s, name))]
@@ -174,7 +174,7 @@ def _held(study: Study) -> list[str]:
 
 
 def zeros_against(study: Study, curves: Sequence[Curve]) -> dict[str, Float[np.ndarray, " C"]]:
-    """What curves of the rig show of zeros that a study holds at 0, by name; NaN: nothing.
+    """What curves with air show of zeros that a study holds at 0, by name; NaN: nothing.
 
     Args:
         study: whose table it is.
@@ -184,12 +184,12 @@ def zeros_against(study: Study, curves: Sequence[Curve]) -> dict[str, Float[np.n
         return {}
     held = [
         p.name for p in study.parameters
-        if p.name in OF_THE_PRESS and p.fixed and not p.auto and p.value == 0
+        if p.name in UNITS and p.fixed and not p.auto and p.value == 0
     ]  # fmt: skip
     if not held:
         return {}
     zeros = zeros_of(curves)
-    value = {"onset": zeros.touch, "force_offset": zeros.offset, "force_slope": zeros.slope}
+    value = {"onset": zeros.touch, "force_offset": zeros.offset}
     return {n: np.where(getattr(zeros, n) & (zeros.air > 1), value[n], np.nan) for n in held}
 
 

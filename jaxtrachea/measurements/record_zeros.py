@@ -116,8 +116,8 @@ def record_zeros(
     return out
 
 
-def begins_flat(displacement: Float[np.ndarray, " N"], force: Float[np.ndarray, " N"]) -> bool:
-    """Whether a record may begin in air: its force stays within the noise for a while.
+def flat_until(displacement: Float[np.ndarray, " N"], force: Float[np.ndarray, " N"]) -> float:
+    """Displacement to which a force stays within its noise, so that there may be air; else NaN.
 
     Args:
         displacement: mm, in any order.
@@ -127,11 +127,12 @@ def begins_flat(displacement: Float[np.ndarray, " N"], force: Float[np.ndarray, 
     D, F = displacement[order][None], force[order][None]
     span, peak = float(D[0, -1] - D[0, 0]), float(np.max(np.abs(F)))
     if D.shape[1] < _FEWEST or not (span > 0 and peak > 0):
-        return False
+        return np.nan
     noise = np.maximum(_noise(D, F), LEAST_NOISE * peak)
     records = _Records(D / span, F / peak, np.full(D.shape, peak / noise))
     end = float(_change_points(records)[0]) * span
-    return int(np.sum(D <= end)) > LINE and end - float(D[0, 0]) > _LONG * span
+    flat = int(np.sum(D <= end)) > LINE and end - float(D[0, 0]) > _LONG * span
+    return end if flat else np.nan
 
 
 class _Records(NamedTuple):
