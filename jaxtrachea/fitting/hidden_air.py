@@ -2,13 +2,13 @@
 
 A record by itself cannot tell some air from a press whose law begins soft: it then takes no onset.
 Where that is wrong the whole specimen is: the other curves follow, and the fit ends in a minimum
-from which no small change asks for an onset (`omitted_zeros`). So a specimen is
-fitted once more with the onsets of its curves that may begin in air, and then with offsets, too,
-where its residuals are larger than the noise of its records and something speaks for air: two other
-records show it, and the fit has moved an onset away from there, or it has markers, which stand
-still in air. A law that is missing from the model may look the same otherwise. The onsets are
-taken where the curves are then explained to their noise, the likelihood gains more than so many
-unknowns do by chance, and these witnesses agree.
+from which no small change asks for an onset (`omitted_zeros`). So a specimen is fitted once more
+with the onsets of its curves that may begin in air, and then with offsets, too, where its residuals
+are larger than the noise of its records and something speaks for air: two other records show it,
+and the fit has moved an onset away from there, or it has markers, which stand still in air. A law
+that is missing from the model may look the same otherwise. The onsets are taken where the curves
+are then explained to their noise, the likelihood gains more than so many unknowns do by chance, and
+these witnesses agree.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,6 +35,8 @@ _EACH = 4.0
 #: standard deviations of markers that stand still.
 _WITNESSES, _STAYS, _STILL = 2, 0.15, 2.0
 _ONSET = ZEROS.index("onset")
+#: By specimen and trial, mm.
+Onsets = Mapping[tuple[str, str], float]
 
 
 class Noise(NamedTuple):
@@ -108,22 +110,27 @@ def _against_records(study: Study, result: FitResult) -> Noise:
         return Noise(result.rms[:, 0] / np.sqrt(square / total), _SPREAD / np.sqrt(total))
 
 
-def _onsets(result: FitResult, lane: int) -> dict[str, float]:
-    """Onsets that curves of a lane have taken, by trial, mm."""
+def _onsets(result: FitResult, lane: int) -> Onsets:
+    """Onsets that curves of a lane have taken."""
     rows = zip(result.study.unknowns[lane], result.value[lane].tolist(), strict=False)
-    return {trial: value for (p, _, trial), value in rows if p.name == "onset"}
+    return {(name, trial): value for (p, name, trial), value in rows if p.name == "onset"}
 
 
-def _stay(study: Study, lane: int, onset: Mapping[str, float]) -> list[bool]:
+def _span(curve: Curve) -> tuple[float, float]:
+    """First displacement of a loading, and from sample to sample, mm."""
+    D = curve.rising.displacement
+    return float(np.min(D)), float(np.ptp(D)) / max(len(D) - 1, 1)
+
+
+def _stay(study: Study, lane: int, onset: Onsets) -> list[bool]:
     """Of records of a lane that show air: whether these onsets are where they show them."""
     out = []
     for t, c in enumerate(study.curves[lane] if study.record_zeros is not None else ()):
-        D = c.rising.displacement
-        first, step = float(np.min(D)), float(np.ptp(D)) / (len(D) - 1)
+        first, step = _span(c)
         assert study.record_zeros is not None
         shown = float(study.record_zeros[lane, t, 0])
         if shown > first:
-            off = abs(onset.get(c.trial, first) - shown)
+            off = abs(onset.get((c.specimen, c.trial), first) - shown)
             out.append(off <= _STAYS * (shown - first) + step)
     return out
 
@@ -140,9 +147,8 @@ def _is_air(
     """
     onset = _onsets(tried, row)
     for c, end in zip(study.curves[lane], ends.tolist(), strict=False):
-        D = c.rising.displacement
-        step = float(np.ptp(D)) / (len(D) - 1)
-        if np.isfinite(end) and not float(np.min(D)) < onset[c.trial] <= end + step:
+        first, step = _span(c)
+        if np.isfinite(end) and not first < onset[c.specimen, c.trial] <= end + step:
             return False
     stay = _stay(study, lane, onset)
     if len(stay) >= _WITNESSES:
@@ -150,12 +156,12 @@ def _is_air(
     return _markers_stand_still(study.curves[lane], onset, float(tried.rms[row, 1]))
 
 
-def _markers_stand_still(curves: Sequence[Curve], onset: Mapping[str, float], noise: float) -> bool:
+def _markers_stand_still(curves: Sequence[Curve], onset: Onsets, noise: float) -> bool:
     """Whether markers do not move before the onsets, by more than twice their residuals."""
     still = []
     for c in curves:
-        if c.joint_displacement is not None and c.trial in onset:
-            before = c.joint_displacement[c.displacement < onset[c.trial]]
+        if c.joint_displacement is not None and (c.specimen, c.trial) in onset:
+            before = c.joint_displacement[c.displacement < onset[c.specimen, c.trial]]
             seen = np.isfinite(before).any()
             still.append(float(np.sqrt(np.nanmean(before**2))) if seen else np.inf)
     return bool(still) and max(still) < _STILL * noise
