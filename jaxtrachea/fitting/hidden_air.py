@@ -100,12 +100,11 @@ def _against_records(study: Study, result: FitResult) -> Noise:
     """Root mean square of the forces' residuals over the noise that records show."""
     assert study.recipe is not None
     assert study.recipe.zeros is not None
-    trials = np.array([len(lane) for lane in study.curves])
     count = np.sum(study.lanes.precision > 0, axis=2)
-    of = np.repeat(np.arange(len(trials)), trials)
-    each = count[of, np.arange(len(of)) - np.repeat(np.cumsum(trials) - trials, trials)]
-    square = np.bincount(of, each * study.recipe.zeros.noise**2, len(trials))
-    total = np.bincount(of, each, len(trials))
+    trials = np.array([len(lane) for lane in study.curves])
+    noise = np.zeros(count.shape)
+    noise[np.arange(count.shape[1]) < trials[:, None]] = study.recipe.zeros.noise
+    square, total = np.sum(count * noise**2, axis=1), np.sum(count, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return Noise(result.rms[:, 0] / np.sqrt(square / total), _SPREAD / np.sqrt(total))
 

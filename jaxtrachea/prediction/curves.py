@@ -10,8 +10,9 @@ is then infinite wherever that combination acts): each has a `PredictionStatus`.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -155,7 +156,6 @@ def predict_sources(
         times: of every displacement of each, s, where the force relaxes.
     """
     turned = [(0.0, (1.0, 0.0))] * len(s) if aside is None else list(aside)
-    run = program(predicted, stored.study.model)
     errors = model_errors(stored, [source.lane for source in sources])
     sources = [_widened(source, errors.get(source.lane)) for source in sources]
     most = _rounded(max(map(len, displacements)), 32)
@@ -185,28 +185,9 @@ def predict_sources(
         motion = motion._replace(phi_c=phi_c, direction=direction)
     blend = stack("blend")
 
-    def answers(rows, free) -> Any:
-        """`Predicted` of curves, numpy, their free parameters given; one row each."""
-        out = None
-        # A rounded corner is another program; mostly all curves have one, or none.
-        for rounded in (False, True):
-            alike = np.isnan(blend) != rounded
-            members = np.flatnonzero(alike[rows])
-            arrays = estimates, motion._replace(blend=blend if rounded else None), slack
-            size = min(batch, _rounded(max(int(alike.sum()), 1), 8))
-            for first in range(0, len(members), size):
-                at = members[first : first + size]
-                full = np.pad(at, (0, size - len(at)), mode="edge")
-                of_rows = jax.tree.map(lambda v, full=full: jnp.asarray(v[rows[full]]), arrays)
-                of_rows = of_rows[0]._replace(free=jnp.asarray(free[full])), *of_rows[1:]
-                part = jax.tree.map(np.asarray, run(*of_rows))
-                if out is None:
-                    out = jax.tree.map(lambda v: np.empty((len(rows), *v.shape[1:]), v.dtype), part)
-                for whole, some in zip(jax.tree.leaves(out), jax.tree.leaves(part), strict=True):
-                    whole[at] = some[: len(at)]
-        return out
-
-    every = answers(np.arange(len(sources)), estimates.free)
+    arrays = _Asked(estimates, motion, slack, blend)
+    answers = functools.partial(_answered, program(predicted, stored.study.model), arrays, batch)
+    every = answers(np.arange(len(sources)), np.asarray(estimates.free))
     parts = [jax.tree.map(lambda v, k=k: v[k], every) for k in range(len(sources))]
     bends = errors_of_bands(stored, sources, displacements, parts, errors, answers)
     out = []
@@ -217,6 +198,40 @@ def predict_sources(
         if times is not None:
             found = _in_time(stored, source, found, np.asarray(times[k], np.float64))
         out.append(_with_misfit(stored, source, errors.get(source.lane), found))
+    return out
+
+
+class _Asked(NamedTuple):
+    """What is asked of every curve; `blend`: rounded corner, NaN: none."""
+
+    estimates: Estimate
+    motion: Motion
+    slack: np.ndarray
+    blend: np.ndarray
+
+
+def _answered(run, asked: _Asked, batch: int, rows: np.ndarray, free: np.ndarray) -> Any:
+    """`Predicted` of curves `rows`, numpy, their free parameters given; one row each."""
+    out = None
+    # A rounded corner is another program; mostly all curves have one, or none.
+    for rounded in (False, True):
+        alike = np.isnan(asked.blend) != rounded
+        members = np.flatnonzero(alike[rows])
+        motion = asked.motion._replace(blend=asked.blend if rounded else None)
+        size = min(batch, _rounded(max(int(alike.sum()), 1), 8))
+        for first in range(0, len(members), size):
+            at = members[first : first + size]
+            full = np.pad(at, (0, size - len(at)), mode="edge")
+            estimates, motion_of, slack = jax.tree.map(
+                lambda v, full=full: jnp.asarray(v[rows[full]]),
+                (asked.estimates, motion, asked.slack),
+            )
+            estimates = estimates._replace(free=jnp.asarray(free[full]))
+            part = jax.tree.map(np.asarray, run(estimates, motion_of, slack))
+            if out is None:
+                out = jax.tree.map(lambda v: np.empty((len(rows), *v.shape[1:]), v.dtype), part)
+            for whole, some in zip(jax.tree.leaves(out), jax.tree.leaves(part), strict=True):
+                whole[at] = some[: len(at)]
     return out
 
 

@@ -19,7 +19,7 @@ n - 1 degrees of freedom.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.cost import weights
@@ -118,18 +118,25 @@ def weighted_rows(
     return r.value * root, r.jacobian * root[:, None], root * precisions(lane)
 
 
+def rows_of(
+    stored: FitResult, lanes: Int[np.ndarray, " n"], theta: Float[np.ndarray, "n P"]
+) -> tuple[Study, Float[np.ndarray, "n T m"], Float[np.ndarray, "n T Jf m"], np.ndarray]:
+    """The study of some lanes, and their `weighted_rows` at `theta`, with the noise of the fit."""
+    study = stored.study.take(lanes)
+    sigma = np.where(study.noise_given, 1.0, stored.observed_sigma[lanes])
+    sigma = np.where(np.isfinite(sigma), sigma, 1.0)
+    found = map_lanes(
+        weighted_rows, study, theta, sigma, batch=study.batch_size(len(lanes), 256)
+    )  # fmt: skip
+    return study, *found
+
+
 def model_errors(stored: FitResult, lanes: list[int]) -> dict[int, ModelError]:
     """Error between positions of some lanes of a fit, each computed once."""
     kept: dict[int, ModelError] = pressed(stored).errors
     missing = [lane for lane in dict.fromkeys(lanes) if lane >= 0 and lane not in kept]
     if missing:
-        study = stored.study.take(np.array(missing))
-        sigma = np.where(study.noise_given, 1.0, stored.observed_sigma[missing])
-        sigma = np.where(np.isfinite(sigma), sigma, 1.0)
-        value, jacobian, root = map_lanes(
-            weighted_rows, study, stored.theta[missing], sigma,
-            batch=study.batch_size(len(missing), 256),
-        )  # fmt: skip
+        study, value, jacobian, root = rows_of(stored, np.array(missing), stored.theta[missing])
         for k, lane in enumerate(missing):
             X = over_unknowns(study, k, jacobian[k], stored.at_bound[lane])
             left = _LeftOut(value[k], X, root[k], study.lanes.force.shape[-1])

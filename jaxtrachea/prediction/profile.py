@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.prediction.core import Predicted
-from jaxtrachea.prediction.model_error import ModelError, over_unknowns, weighted_rows
+from jaxtrachea.prediction.model_error import ModelError, over_unknowns, rows_of
 from jaxtrachea.prediction.sources import CurveParameters
 
 #: Error of the linear band at its ends, in half-widths, from which it is called bent.
@@ -138,15 +137,10 @@ def _error_of_ends(
         target: force at the end of the band less that of the estimates, N.
         expected: twice the cost that it is at by the covariance of the estimates.
     """
-    study = stored.study.take(lanes)
-    sigma = np.where(study.noise_given, 1.0, stored.observed_sigma[lanes])
-    sigma = np.where(np.isfinite(sigma), sigma, 1.0)
     theta = stored.theta[lanes]
 
     def rows(moved):
-        value, jacobian, _ = map_lanes(
-            weighted_rows, study, theta + moved, sigma, batch=study.batch_size(len(lanes), 256)
-        )
+        study, value, jacobian, _ = rows_of(stored, lanes, theta + moved)
         of_lanes = (
             over_unknowns(study, k, jacobian[k], stored.at_bound[lane])
             for k, lane in enumerate(lanes)
