@@ -4,12 +4,12 @@ A record by itself cannot tell some air from a press whose law begins soft: it t
 Where that is wrong the whole specimen is: the other curves follow, and the fit ends in a minimum
 from which no small change asks for an onset, or from which an offset seems to be missing
 (`omitted_zeros`). So a specimen whose residuals are larger than the noise of its records, or ask
-for a zero, is fitted once more with the onsets of all curves that may begin in air, and then with
-offsets, too. Where its curves are explained to their noise by these, the likelihood gains more than
-so many unknowns do by chance, and onsets lie where air may be, there are two readings. A law that
-is missing from the model may look like air. So the onsets are taken where witnesses agree: two
-other records that show air and whose onsets stay there, or markers, which stand still in air. Else
-the fit stays as it is, and its intervals hold those of the other reading (`with_doubts`).
+for a zero, is fitted with the onsets of all curves that may begin in air, and with offsets, too.
+Where either explains its curves to their noise, the likelihood gains more than so many unknowns do
+by chance, and onsets lie where air may be, there are two readings. A law that is missing from the
+model may look like air. So the zeros are taken where witnesses agree: two other records that show
+air and whose onsets stay there, or markers, which stand still in air. Else the fit stays as it is,
+and its intervals hold those of the other reading (`with_doubts`).
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxtrachea.fitting.build import with_zeros
 from jaxtrachea.fitting.omitted_zeros import ZEROS, Asked, able_zeros, asking
@@ -102,9 +102,8 @@ def hidden_air(
         for t, c in enumerate(study.curves[k]):
             if able[k, _ONSET, t]:
                 ends[k, t] = _latest(c)
-    for zeros in (ZEROS[:1], ZEROS):  # an offset, too, where an onset alone does not explain it
-        if not len(lanes):
-            break
+    best = {}
+    for zeros in (ZEROS[:1], ZEROS) if len(lanes) else ():
         taken = able & np.isin(ZEROS, zeros)[:, None]
         names = {
             (c.specimen, c.trial): {ZEROS[z] for z in np.flatnonzero(taken[k, :, t])}
@@ -113,23 +112,30 @@ def hidden_air(
             if taken[k, :, t].any()
         }
         tried = fit(with_zeros(study, names, lanes))
-        added = np.sum(taken[lanes], axis=(1, 2))
-        better = _better(study, result, lanes, tried, noise, added)
-        for row in np.flatnonzero(better).tolist():
-            lane = int(lanes[row])
-            if not _in_air(study, lane, ends[lane], tried, row):
-                better[row] = False
-                continue
-            if not _witnessed(study, lane, tried, row):
-                out.doubts[lane] = _estimates(tried, row)
-                continue
-            for key in [(c.specimen, c.trial) for c in study.curves[lane]]:
-                out.asked.names.pop(key, None)
-                out.asked.names.update({key: names[key]} if key in names else {})
-            for (p, *of), value in zip(tried.study.unknowns[row], tried.value[row], strict=False):
-                out.asked.value[of[0], of[1], p.name] = float(value)
-        lanes = lanes[~better]
+        gain = _gain(study, result, lanes, tried, noise) - _EACH * taken[lanes].sum(axis=(1, 2))
+        for row, lane in enumerate(lanes.tolist()):
+            least = best[lane].gain if lane in best else EVIDENCE
+            if gain[row] > least and _in_air(study, lane, ends[lane], tried, row):
+                best[lane] = _Reading(float(gain[row]), names, tried, row)
+    for lane, (_, names, tried, row) in best.items():
+        if not _witnessed(study, lane, tried, row):
+            out.doubts[lane] = _estimates(tried, row)
+            continue
+        for key in [(c.specimen, c.trial) for c in study.curves[lane]]:
+            out.asked.names.pop(key, None)
+            out.asked.names.update({key: names[key]} if key in names else {})
+        for (p, *of), value in zip(tried.study.unknowns[row], tried.value[row], strict=False):
+            out.asked.value[of[0], of[1], p.name] = float(value)
     return out
+
+
+class _Reading(NamedTuple):
+    """Zeros that explain a lane: what they gain, and row `row` of the fit with them."""
+
+    gain: float
+    names: Mapping[tuple[str, str], set[str]]
+    tried: FitResult
+    row: int
 
 
 def with_doubts(result: FitResult, doubts: Doubts) -> FitResult:
@@ -247,15 +253,10 @@ def _markers_stand_still(curves: Sequence[Curve], onset: Onsets, noise: float) -
     return bool(still) and max(still) < _STILL * noise
 
 
-def _better(
-    study: Study,
-    result: FitResult,
-    lanes: Int[np.ndarray, " n"],
-    tried: FitResult,
-    noise: Noise,
-    added: Int[np.ndarray, " n"],
-) -> Bool[np.ndarray, " n"]:
-    """Lanes that are explained with `added` zeros, and gain enough by them."""
+def _gain(
+    study: Study, result: FitResult, lanes: Int[np.ndarray, " n"], tried: FitResult, noise: Noise
+) -> Float[np.ndarray, " n"]:
+    """Gain in -2 ln L of lanes by a fit with more zeros; -inf where these do not explain them."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = tried.rms / result.rms[lanes]
         explains = noise.ratio[lanes] * ratio[:, 0] < 1 + _EXPLAINS * noise.error[lanes]
@@ -264,4 +265,4 @@ def _better(
         gain = -2 * np.nansum(counts * np.log(ratio), axis=1)
     if study.noise_given[0]:
         gain = 2 * (result.cost[lanes] - tried.cost)
-    return tried.succeeded & explains & (gain > EVIDENCE + _EACH * added)
+    return np.where(tried.succeeded & explains, gain, -np.inf)
