@@ -175,7 +175,7 @@ BAD_DATA = {
     "infinite": (GOOD.replace("0.66", "inf").encode(), ["T01 1", "non_finite"]),
     "falling": (
         GOOD.replace("0.0,", "9.0,").replace("0.5,", "8.0,").replace("1.0,", "7.0,").encode(),
-        ["T01 1", "non_monotone", "an unloading branch"],
+        ["T01 1", "non_monotone", "counted the other way; set displacement_sign = -1"],
     ),
     "no signal": ((HEAD + "a,1,9,0,0\na,1,9,1,0\n").encode(), ["a 1", "no_signal"]),
     "one point": ((HEAD + "a,1,9,0,0\n").encode(), ["a 1", "too_few_points"]),

@@ -58,3 +58,10 @@ SHIPPED = sorted(p for p in (ROOT / "fits").glob("*/*.toml") if p.name != "scene
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.name)
 def test_shipped_specifications_load(path):
     assert load_fit_spec(path).title
+
+
+def test_a_data_file_in_the_place_of_a_specification_is_told(tmp_path):
+    data = tmp_path / "pressed.csv"
+    data.write_text("displacement,force\n0,0\n1,2\n")
+    with pytest.raises(SpecError, match=r"a data file.*jaxtrachea init .*pressed\.csv"):
+        load_fit_spec(data)

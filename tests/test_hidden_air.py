@@ -11,6 +11,7 @@ from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.hidden_air import hidden_air
+from jaxtrachea.fitting.omitted_zeros import Asked
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.record_zeros import flat_until
@@ -112,13 +113,62 @@ def test_a_law_that_is_missing_is_not_air(power):
     assert max(taken) < len(PLACES)
 
 
-def test_healthy_lanes_are_not_fitted_again():
-    rng = np.random.default_rng(5)
-    curves = [record(rng, f"T{i}", s, 0.0, 0.0, 2.0, 0.02, False) for i in range(3) for s in PLACES]
+def test_healthy_lanes_are_seldom_fitted_again():
+    """Of normal noise 7 % exceed what their records show by 1.5 of its errors."""
+    rng, again = np.random.default_rng(5), []
+    curves = [
+        record(rng, f"T{i}", s, 0.0, 0.0, 2.0, 0.02, False) for i in range(20) for s in PLACES
+    ]
     study = build_study(curves, table_1())
-    result = fit(study.take(np.arange(3)), Settings(starts=2, verify=False))
+    result = fit(study.take(np.arange(20)), Settings(starts=2, verify=False))
 
-    def never(part):
-        raise AssertionError(f"{len(part.curves)} lanes fitted again")
+    def tried(part):
+        again.append(len(part.curves))
+        return fit(part.take(np.arange(again[-1])), Settings(starts=2, verify=False))
 
-    assert not hidden_air(study, result, never).names
+    found = hidden_air(study, result, Asked({}, {}), tried)
+    assert not found.asked.names
+    assert not found.doubts
+    assert max(again, default=0) <= 5
+
+
+def specimen(seed, how, places, noise, depth, samples):
+    """Curves of one specimen of `TRUTH`; `how`: air at each place, mm."""
+    rng, curves = np.random.default_rng(seed), []
+    for s, air in zip(places, how, strict=True):
+        way = np.linspace(-air, depth, samples)
+        force = press(s, way)[0] + noise * rng.normal(size=samples)
+        curves.append(Curve("A", f"s{s:g}", s, 0.0, way + air, force))
+    return curves
+
+
+def intervals(curves):
+    """Value, interval and verdict of every parameter of the specimen, and its minima."""
+    result = fit(build_study(curves, table_1()), Settings())
+    of = [assess(result, 0, i) for i in range(len(result.study.unknowns[0]))]
+    names = [p.name for p, _, _ in result.study.unknowns[0]]
+    return dict(zip(names, of, strict=True)), names.count("onset"), int(result.minima[0])
+
+
+FIVE = (4.0, 12.0, 30.0, 55.0, 75.0)
+
+
+def test_air_of_all_curves_that_is_no_flat_beginning():
+    """0.15 of 2.15 mm: four samples of 51, too few for `flat_until`; k_1 was 0.95 for 1.2."""
+    for seed in range(3):
+        found, onsets, _ = intervals(specimen(seed, [0.15] * 5, FIVE, 0.017, 2.0, 51))
+        for name, truth in TRUTH.items():
+            assert found[name].low < truth < found[name].high, (seed, name, found[name])
+        assert onsets in (0, 5) or found["k_1"].verdict != "identifiable"
+
+
+def test_air_that_nothing_speaks_for_is_in_the_intervals():
+    """Two samples of air in three of five: offsets were taken, k_1 was 8 errors off."""
+    airs = [0.25, 0.0, 0.25, 0.0, 0.25]
+    apart = 0
+    for seed in range(4):
+        found, _, minima = intervals(specimen(seed, airs, FIVE, 0.15, 4.0, 31))
+        for name, truth in TRUTH.items():
+            assert found[name].low < truth < found[name].high, (seed, name, found[name])
+        apart += minima > 1
+    assert apart

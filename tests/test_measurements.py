@@ -228,6 +228,7 @@ def test_varying_position(tmp_path):
             "stands still at its peak for 30 samples, from line 12 on; the force falls by 3",
         ),
         ([(2, 2), (1, 1), (0, 0)], {}, "non_monotone", "an unloading branch"),
+        ([(10, 0), (9, 1), (7, 2)], {}, "non_monotone", "while the force rises"),
     ],
 )
 def test_bad_curve(tmp_path, rows, options, kind, message):

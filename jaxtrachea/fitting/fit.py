@@ -18,7 +18,7 @@ from jaxtrachea.fitting.force_share import (
     with_found_shares,
     with_levels,
 )
-from jaxtrachea.fitting.hidden_air import hidden_air
+from jaxtrachea.fitting.hidden_air import hidden_air, with_doubts
 from jaxtrachea.fitting.information import fixed_count, marginal, summed_gradient
 from jaxtrachea.fitting.lane import markers
 from jaxtrachea.fitting.minima import (
@@ -29,7 +29,7 @@ from jaxtrachea.fitting.minima import (
 )
 from jaxtrachea.fitting.needs_review import needs_review, still_needs_review
 from jaxtrachea.fitting.noise import next_sigma, normal_psi2, precision_unit
-from jaxtrachea.fitting.omitted_zeros import asked_for, merged, near_estimates
+from jaxtrachea.fitting.omitted_zeros import asked_for, asking, merged, near_estimates
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
@@ -37,7 +37,6 @@ from jaxtrachea.fitting.starts import scales, unscaled
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verify import no_evidence, verify_minimum
-from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
@@ -113,33 +112,25 @@ def with_omitted_zeros(
     if study.recipe is None:
         return result
     quick = dataclasses.replace(settings, verify=False)
-    rows = np.arange(result.lanes)
-    for turn in range(1 + MORE_ZEROS):
-        if turn:
-            asked = asked_for(result, rows)
-        else:
-            asked = hidden_air(
-                study, result, lambda part: _without_more_zeros(part, quick, alive, None, None)
-            )
-        if not asked.names and turn:
-            break
+    rows, doubts = np.arange(result.lanes), {}
+    for turn in range(MORE_ZEROS):
+        asked = asked_for(result, rows)
+        if not turn:
+            asked, doubts = hidden_air(
+                study, result, asked,
+                lambda part: _without_more_zeros(part, quick, alive, None, None),
+            )  # fmt: skip
         if not asked.names:
-            continue
+            break
         study = with_zeros(study, asked.names)
         near = near_estimates(result, study, asked)
         _log.info("%d curves ask for an onset or an offset; fitted again", len(asked.names))
-        asking = [any(_key(c) in asked.names for c in lane) for lane in study.curves]
-        again = np.flatnonzero(asking)
+        again = rows = asking(study, asked)  # who asked for nothing does not later
         # As large as the data; who asks for them again has them computed again.
         vars(result).pop("residuals", None)
         new = _without_more_zeros(study.take(again), settings, alive, None, near[again])
         result = merged(study, result, again, new)
-        rows = again if turn else rows  # who asked for nothing does not later
-    return result
-
-
-def _key(curve: Curve) -> tuple[str, str]:
-    return curve.specimen, curve.trial
+    return with_doubts(result, doubts)
 
 
 def _by_zeros(study: Study, settings: Settings, progress, starts, beside) -> FitResult:

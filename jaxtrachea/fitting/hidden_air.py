@@ -1,42 +1,74 @@
-"""Air that records hide behind a soft beginning, of specimens whose fit misses their curves.
+"""Air that records hide behind a soft beginning, which the fit of their specimen does not see.
 
 A record by itself cannot tell some air from a press whose law begins soft: it then takes no onset.
 Where that is wrong the whole specimen is: the other curves follow, and the fit ends in a minimum
-from which no small change asks for an onset (`omitted_zeros`). So a specimen is fitted once more
-with the onsets of its curves that may begin in air, and then with offsets, too, where its residuals
-are larger than the noise of its records and something speaks for air: two other records show it,
-and the fit has moved an onset away from there, or it has markers, which stand still in air. A law
-that is missing from the model may look the same otherwise. The onsets are taken where the curves
-are then explained to their noise, the likelihood gains more than so many unknowns do by chance, and
-these witnesses agree.
+from which no small change asks for an onset, or from which an offset seems to be missing
+(`omitted_zeros`). So a specimen whose residuals are larger than the noise of its records, or ask
+for a zero, is fitted with the onsets of all curves that may begin in air, and with offsets, too.
+Where either explains its curves to their noise, the likelihood gains more than so many unknowns do
+by chance, and onsets lie where air may be, there are two readings. A law that is missing from the
+model may look like air. So the zeros are taken where witnesses agree: two other records that show
+air and whose onsets stay there, or markers, which stand still in air. Else the fit stays as it is,
+and its intervals hold those of the other reading (`with_doubts`).
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxtrachea.fitting.build import with_zeros
-from jaxtrachea.fitting.omitted_zeros import ZEROS, Asked, able_zeros
+from jaxtrachea.fitting.omitted_zeros import ZEROS, Asked, able_zeros, asking
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.record_zeros import EVIDENCE, flat_until
+from jaxtrachea.status import ProfileEnd
 
 #: Relative error of the noise of n samples, as a record tells it, times sqrt(n).
 _SPREAD = 1.2
 #: Such errors by which residuals exceed the noise where another fit is worth its time, and up to
 #: which they may where it explains the curves.
-_MISSES, _EXPLAINS = 2.0, 3.0
+_MISSES, _EXPLAINS = 1.5, 3.0
 #: Gain in -2 ln L of each further zero beside `EVIDENCE`.
 _EACH = 4.0
 #: Records of a specimen that must show air, share of it by which their onsets may move, and
 #: standard deviations of markers that stand still.
 _WITNESSES, _STAYS, _STILL = 2, 0.15, 2.0
+#: Share of a record that may be hidden air.
+_HIDDEN = 0.2
+#: Ratio from which noise hides no air.
+_FAR = 6.0
 _ONSET = ZEROS.index("onset")
 #: By specimen and trial, mm.
 Onsets = Mapping[tuple[str, str], float]
+
+
+class Estimate(NamedTuple):
+    """With its 95 % interval."""
+
+    low: float
+    value: float
+    high: float
+
+
+#: By name, specimen and trial; and these of lanes.
+Estimates = dict[tuple[str, str, str], Estimate]
+Doubts = dict[int, Estimates]
+
+
+class Found(NamedTuple):
+    """What hidden air does to lanes.
+
+    Attributes:
+        asked: zeros that are taken.
+        doubts: what would come out of lanes that air explains, too, but nothing else speaks for.
+    """
+
+    asked: Asked
+    doubts: Doubts
 
 
 class Noise(NamedTuple):
@@ -46,35 +78,32 @@ class Noise(NamedTuple):
     error: Float[np.ndarray, " lanes"]
 
 
-def hidden_air(study: Study, result: FitResult, fit: Callable[[Study], FitResult]) -> Asked:
-    """Onsets and offsets without which lanes are not explained, and all that their fits find.
+def hidden_air(
+    study: Study, result: FitResult, asked: Asked, fit: Callable[[Study], FitResult]
+) -> Found:
+    """Onsets and offsets without which lanes are not explained, and those that cannot be told.
 
     Args:
         study: with a recipe, whose records were looked at.
         result: of it.
+        asked: zeros that its residuals ask for.
         fit: of some lanes, without scrutiny.
     """
-    out = Asked({}, {})
+    out = Found(Asked(dict(asked.names), dict(asked.value)), {})
     if study.recipe is None or study.recipe.zeros is None:
         return out
     able = able_zeros(result)
     noise = _against_records(study, result)
     misses = noise.ratio > 1 + _MISSES * noise.error
-    marked = result.samples > np.sum(study.lanes.precision > 0, axis=(1, 2))
-    lanes = np.flatnonzero(able[:, _ONSET].any(axis=1) & misses)
-    stay = {k: _stay(study, k, _onsets(result, k)) for k in lanes.tolist()}
-    moved = [k for k, v in stay.items() if False in v and len(v) >= _WITNESSES]
-    lanes = lanes[marked[lanes] | np.isin(lanes, moved)]
+    misses[asking(study, asked)] = True
+    lanes = np.flatnonzero(able[:, _ONSET].any(axis=1) & misses & (noise.ratio < _FAR))
     ends = np.full(able.shape[::2], np.nan)
     for k in lanes.tolist():
         for t, c in enumerate(study.curves[k]):
             if able[k, _ONSET, t]:
-                ends[k, t] = flat_until(c.rising.displacement, c.rising.force)
-    able &= np.isfinite(ends)[:, None]
-    lanes = lanes[np.isfinite(ends[lanes]).any(axis=1)]
-    for zeros in (ZEROS[:1], ZEROS):  # an offset, too, where an onset alone does not explain it
-        if not len(lanes):
-            break
+                ends[k, t] = _latest(c)
+    best = {}
+    for zeros in (ZEROS[:1], ZEROS) if len(lanes) else ():
         taken = able & np.isin(ZEROS, zeros)[:, None]
         names = {
             (c.specimen, c.trial): {ZEROS[z] for z in np.flatnonzero(taken[k, :, t])}
@@ -83,17 +112,71 @@ def hidden_air(study: Study, result: FitResult, fit: Callable[[Study], FitResult
             if taken[k, :, t].any()
         }
         tried = fit(with_zeros(study, names, lanes))
-        added = np.sum(taken[lanes], axis=(1, 2))
-        better = _better(study, result, lanes, tried, noise, added)
-        for row in np.flatnonzero(better).tolist():
-            better[row] = _is_air(study, int(lanes[row]), ends[lanes[row]], tried, row)
-        for row in np.flatnonzero(better).tolist():
-            keys = [(c.specimen, c.trial) for c in study.curves[lanes[row]]]
-            out.names.update({key: names[key] for key in keys if key in names})
-            for (p, *of), value in zip(tried.study.unknowns[row], tried.value[row], strict=False):
-                out.value[of[0], of[1], p.name] = float(value)
-        lanes = lanes[~better]
+        gain = _gain(study, result, lanes, tried, noise) - _EACH * taken[lanes].sum(axis=(1, 2))
+        for row, lane in enumerate(lanes.tolist()):
+            least = best[lane].gain if lane in best else EVIDENCE
+            if gain[row] > least and _in_air(study, lane, ends[lane], tried, row):
+                best[lane] = _Reading(float(gain[row]), names, tried, row)
+    for lane, (_, names, tried, row) in best.items():
+        if not _witnessed(study, lane, tried, row):
+            out.doubts[lane] = _estimates(tried, row)
+            continue
+        for key in [(c.specimen, c.trial) for c in study.curves[lane]]:
+            out.asked.names.pop(key, None)
+            out.asked.names.update({key: names[key]} if key in names else {})
+        for (p, *of), value in zip(tried.study.unknowns[row], tried.value[row], strict=False):
+            out.asked.value[of[0], of[1], p.name] = float(value)
     return out
+
+
+class _Reading(NamedTuple):
+    """Zeros that explain a lane: what they gain, and row `row` of the fit with them."""
+
+    gain: float
+    names: Mapping[tuple[str, str], set[str]]
+    tried: FitResult
+    row: int
+
+
+def with_doubts(result: FitResult, doubts: Doubts) -> FitResult:
+    """A fit whose intervals hold those of lanes with air, where these say something else."""
+    out = {n: getattr(result, n).copy() for n in ("evidence_low", "evidence_high", "evidence_end")}
+    low, high, end = out.values()
+    minima = result.minima.copy()
+    for lane, with_air in doubts.items():
+        found = []
+        for i, (p, name, trial) in enumerate(result.study.unknowns[lane]):
+            none = Estimate(p.value, p.value, p.value) if p.auto else None
+            if (other := with_air.get((p.name, name, trial), none)) is not None:
+                found.append(((lane, i), other))
+        if all(
+            result.lower[at] <= other.value <= result.upper[at]
+            and other.low <= result.value[at] <= other.high
+            for at, other in found
+        ):
+            continue
+        minima[lane] = max(minima[lane], 2)
+        for at, other in found:
+            low[at] = np.nanmin([low[at], result.lower[at], other.low])
+            high[at] = np.nanmax([high[at], result.upper[at], other.high])
+            end[at] = np.maximum(end[at], ProfileEnd.CLOSED)
+    return dataclasses.replace(result, minima=minima, **out) if doubts else result
+
+
+def _estimates(tried: FitResult, row: int) -> Estimates:
+    """Estimates of a lane."""
+    low, value, high = (v[row].tolist() for v in (tried.lower, tried.value, tried.upper))
+    return {
+        (p.name, name, trial): Estimate(low[i], value[i], high[i])
+        for i, (p, name, trial) in enumerate(tried.study.unknowns[row])
+    }
+
+
+def _latest(curve: Curve) -> float:
+    """Where a hidden air of a curve may end, mm: its flat beginning, or `_HIDDEN` of it."""
+    D = curve.rising.displacement
+    end = flat_until(D, curve.rising.force)
+    return end if np.isfinite(end) else float(np.min(D) + _HIDDEN * np.ptp(D))
 
 
 def _against_records(study: Study, result: FitResult) -> Noise:
@@ -134,21 +217,25 @@ def _stay(study: Study, lane: int, onset: Onsets) -> list[bool]:
     return out
 
 
-def _is_air(
+def _in_air(
     study: Study, lane: int, ends: Float[np.ndarray, " T"], tried: FitResult, row: int
 ) -> bool:
-    """Whether onsets of a lane, tried in `row`, are what its witnesses say.
-
-    An onset that is added lies between the first sample and the end of its flat beginning (`ends`,
-    NaN: not added). Those that records show are back where these show them: where all move
-    together, they stand for a law that is missing. Without such records markers stand still in all
-    of the air.
-    """
+    """Whether onsets that are added lie between the first sample and where air may end (`ends`)."""
     onset = _onsets(tried, row)
     for c, end in zip(study.curves[lane], ends.tolist(), strict=False):
         first, step = _span(c)
-        if np.isfinite(end) and not first < onset[c.specimen, c.trial] <= end + step:
+        if np.isfinite(end) and not first - step <= onset[c.specimen, c.trial] <= end + step:
             return False
+    return True
+
+
+def _witnessed(study: Study, lane: int, tried: FitResult, row: int) -> bool:
+    """Whether onsets of a lane, tried in `row`, are what its witnesses say.
+
+    Those that records show are where these show them: where all move together, they stand for a law
+    that is missing. Without such records markers stand still in all of the air.
+    """
+    onset = _onsets(tried, row)
     stay = _stay(study, lane, onset)
     if len(stay) >= _WITNESSES:
         return all(stay)
@@ -166,15 +253,10 @@ def _markers_stand_still(curves: Sequence[Curve], onset: Onsets, noise: float) -
     return bool(still) and max(still) < _STILL * noise
 
 
-def _better(
-    study: Study,
-    result: FitResult,
-    lanes: Int[np.ndarray, " n"],
-    tried: FitResult,
-    noise: Noise,
-    added: Int[np.ndarray, " n"],
-) -> Bool[np.ndarray, " n"]:
-    """Lanes that are explained with `added` zeros, and gain enough by them."""
+def _gain(
+    study: Study, result: FitResult, lanes: Int[np.ndarray, " n"], tried: FitResult, noise: Noise
+) -> Float[np.ndarray, " n"]:
+    """Gain in -2 ln L of lanes by a fit with more zeros; -inf where these do not explain them."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = tried.rms / result.rms[lanes]
         explains = noise.ratio[lanes] * ratio[:, 0] < 1 + _EXPLAINS * noise.error[lanes]
@@ -183,4 +265,4 @@ def _better(
         gain = -2 * np.nansum(counts * np.log(ratio), axis=1)
     if study.noise_given[0]:
         gain = 2 * (result.cost[lanes] - tried.cost)
-    return tried.succeeded & explains & (gain > EVIDENCE + _EACH * added)
+    return np.where(tried.succeeded & explains, gain, -np.inf)

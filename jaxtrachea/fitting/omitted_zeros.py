@@ -97,6 +97,12 @@ def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
     return out
 
 
+def asking(study: Study, asked: Asked) -> Int[np.ndarray, " n"]:
+    """Lanes of a study that ask for a zero."""
+    each = [any((c.specimen, c.trial) in asked.names for c in lane) for lane in study.curves]
+    return np.flatnonzero(each)
+
+
 def _ask(result: FitResult, lanes: Int[np.ndarray, " n"], able, out: Asked) -> None:
     """Add what some lanes ask for."""
     columns = _columns(result, lanes, result.theta[lanes], result.study.take(lanes))

@@ -50,9 +50,16 @@ def segments_of(
         if options.loading == "all":
             return None
         start, end = error.args
+        falls = f"displacement falls from {start:.4g} to {end:.4g} mm"
+        if force[-1] > force[0]:
+            raise Fault(
+                "non_monotone",
+                f"{falls} while the force rises: it is counted the other way",
+                "set displacement_sign = -1",
+            ) from None
         raise Fault(
             "non_monotone",
-            f"displacement falls from {start:.4g} to {end:.4g} mm: an unloading branch",
+            f"{falls}: an unloading branch",
             'give the loading branch, or use loading = "all"',
         ) from None
 
