@@ -27,7 +27,7 @@ from jaxtrachea.runs.shards import divide, join, load, replaced, save
 MORE_STARTS = 4
 #: Shards after which their programs are let go: those of few lanes come to 200 MB, and what all
 #: lanes want is loaded again in a second.
-SHARDS = 3
+SHARDS = 12
 #: Seconds between two looks at the threads.
 LOOK = 0.02
 
