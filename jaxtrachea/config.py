@@ -365,7 +365,7 @@ class FitSection(Section):
     loss_scale: float = Field(1.345, gt=0)
     """residual, in standard deviations, where the loss turns robust"""
     starts: int = Field(4, ge=1, le=10_000)
-    """starts per fit; more than 64 saved together, of curves of 96 samples and more, begin on 48
+    """starts per fit; more than 2,048 saved together, of curves of 96 samples and more, begin on 24
     samples of each
     """
     start_decades: float = Field(1.0, ge=0, le=10)

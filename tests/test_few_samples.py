@@ -27,8 +27,9 @@ LENGTHS = (40, 33, 24, 7)
 
 @pytest.fixture(autouse=True)
 def short_curves_are_long(monkeypatch):
-    """Twelve of twenty-four samples instead of 48 of 96."""
-    monkeypatch.setattr(few_samples, "KEPT", 12)
+    """Twelve of twenty-four samples instead of 24 of 96, of few starts."""
+    for name, value in {"KEPT": 12, "LONG": 24, "MOST_WHOLE": 64}.items():
+        monkeypatch.setattr(few_samples, name, value)
 
 
 def curves(lanes=LANES, seed=5):
@@ -122,7 +123,7 @@ def test_where_they_do_not_serve(study, changes, more, monkeypatch):
     settings = Settings(**changes)
     assert serves(study_of(every), Settings(), 4 * LANES)
     assert not serves(study, settings, settings.starts * LANES)
-    monkeypatch.setattr(few_samples, "KEPT", 21)  # of 40 samples
+    monkeypatch.setattr(few_samples, "LONG", 41)  # of 40 samples
     assert not serves(study_of(every), Settings(), 4 * LANES)
 
 

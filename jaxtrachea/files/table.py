@@ -12,11 +12,11 @@ OWASP recommends ("CSV injection", https://owasp.org/www-community/attacks/CSV_I
 import csv
 import dataclasses
 import html
-import io
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 #: Cells by name.
@@ -235,22 +235,21 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
         rows: asked for one after the other.
     """
     names: dict[str, None] = {}
-    lines: list[tuple[int, str]] = []
+    lines: list[str] = []
+    known: list[int] = []
+    writer = csv.writer(SimpleNamespace(write=lines.append))
     for row in rows:
         names |= dict.fromkeys(row)
-        lines.append((len(names), _line(quoted(row.get(name)) for name in names)))
+        known.append(len(names))
+        cells = map(row.get, names)
+        writer.writerow([quoted(cell) if isinstance(cell, str) else cell for cell in cells])
+    writer.writerow(map(quoted, names))
+    head = lines.pop()
     with path.open("w", encoding="utf-8", newline="") as stream:
-        stream.write(_line(map(quoted, names)) + "\r\n")
-        stream.writelines(
-            f"{line}{',' * (len(names) - max(known, 1))}\r\n" for known, line in lines
-        )
-
-
-def _line(cells: Iterable[object]) -> str:
-    """A line of a CSV file, without its end."""
-    text = io.StringIO(newline="")
-    csv.writer(text).writerow(cells)
-    return text.getvalue().removesuffix("\r\n")
+        stream.write(head)
+        for n, line in zip(known, lines, strict=True):
+            more = len(names) - max(n, 1)
+            stream.write(line[:-2] + "," * more + line[-2:])
 
 
 def ends(low: str, high: str) -> Callable[[Row], object]:

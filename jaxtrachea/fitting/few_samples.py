@@ -11,10 +11,10 @@ from jaxtrachea.optimisation.batching import on_cpu
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
-#: Samples kept of a curve, and how many times as many the longest of a study has at least.
-KEPT, TIMES = 48, 2
-#: Starts up to which compiling one more program takes longer.
-MOST_WHOLE = 64
+#: Samples kept of a curve, and of the longest of a study at least.
+KEPT, LONG = 24, 96
+#: Starts up to which compiling one more program takes longer than it saves in several runs.
+MOST_WHOLE = 2048
 #: Width of the cells, in scaled coordinates, in which starts of a lane have come to the same point.
 SAME = 1e-3
 
@@ -30,7 +30,7 @@ def serves(study: Study, settings: Settings, starts: int) -> bool:
     measured, go their own way.
     """
     lanes, model = study.lanes, study.model
-    long = lanes.force.shape[-1] >= TIMES * KEPT and starts > MOST_WHOLE
+    long = lanes.force.shape[-1] >= LONG and starts > MOST_WHOLE
     forces_alone = "joints" not in lanes.others and lanes.time is None and not model.level.iterates
     tells = forces_alone and lanes.blend is None and model.loss == "linear" and settings.verify
     solver = settings.method == "levenberg-marquardt" and not settings.float32

@@ -52,7 +52,7 @@ _HINT, FEW = 12.0, 6
 #: Samples from which the noise of a record is known well.
 _LONG_RECORD = 40
 #: Samples looked at, and records fitted, together.
-_TOGETHER, _FITTED_TOGETHER = 1 << 18, 512
+_TOGETHER, _FITTED_TOGETHER = 1 << 20, 512
 
 
 class Zeros(NamedTuple):

@@ -21,13 +21,13 @@ from jaxtrachea.optimisation.programs import forget
 from jaxtrachea.results.read import read_again
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
-from jaxtrachea.runs.shards import divide, join, load, replaced, save
+from jaxtrachea.runs.shards import divide, join, load, replaced, save, shard
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
 #: Shards after which their programs are let go: those of few lanes come to 200 MB, and what all
 #: lanes want is loaded again in a second.
-SHARDS = 3
+SHARDS = 12
 #: Seconds between two looks at the threads.
 LOOK = 0.02
 
@@ -86,7 +86,7 @@ def fit_shards(
                     raise _Ended
                 progress(done, jobs)
 
-        result = fit(part.take(shards[k]), settings, tell)
+        result = fit(shard(part, shards[k], len(shards)), settings, tell)
         save(run.shard(k), run.manifest, shards[k], result)
         if next(saved) % SHARDS == 0:
             forget()

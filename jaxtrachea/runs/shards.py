@@ -6,6 +6,7 @@ depend on when a run was stopped, nor on which process, device or thread fitted 
 """
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -52,14 +53,21 @@ def divide(lanes: int, most: int) -> list[np.ndarray]:
     return np.array_split(np.arange(lanes), -(-lanes // most))
 
 
+def shard(study: Study, lanes: np.ndarray, of: int) -> Study:
+    """The lanes of one of `of` shards, as a study to be fitted."""
+    return dataclasses.replace(study.take(lanes), shards=of)
+
+
 def slots(study: Study, free: float) -> int:
-    """Lanes to compute together, a power of two: what memory and, on a CPU, the cache can hold.
+    """Lanes to compute together at most, a power of two: as many as memory can hold.
+
+    How many of these a CPU's cache can hold each solve asks for itself: of a few samples more.
 
     Args:
         free: memory of the device that is free, bytes.
     """
     fitting = max_in_memory(study.bytes_per_lane, free)
-    return min(max_slots(), study.max_batch, fitting)
+    return min(max_slots(), fitting)
 
 
 def worker_devices(threads: int | None = None) -> list:
