@@ -122,7 +122,7 @@ def test_healthy_lanes_are_seldom_fitted_again():
     study = build_study(curves, table_1())
     result = fit(study.take(np.arange(20)), Settings(starts=2, verify=False))
 
-    def tried(part):
+    def tried(part, near):
         again.append(len(part.curves))
         return fit(part.take(np.arange(again[-1])), Settings(starts=2, verify=False))
 

@@ -111,24 +111,25 @@ def with_omitted_zeros(
     alive = None if progress is None else lambda done, of: progress(0, of)
     if study.recipe is None:
         return result
-    quick = dataclasses.replace(settings, verify=False)
+    quick = dataclasses.replace(settings, verify=False, starts=1)  # and one beside it
     rows, doubts = np.arange(result.lanes), {}
     for turn in range(MORE_ZEROS):
         asked = asked_for(result, rows)
         if not turn:
             asked, doubts = hidden_air(
                 study, result, asked,
-                lambda part: _without_more_zeros(part, quick, alive, None, None),
+                lambda part, near: _without_more_zeros(part, quick, alive, None, near),
             )  # fmt: skip
         if not asked.names:
             break
         study = with_zeros(study, asked.names)
-        near = near_estimates(result, study, asked)
         _log.info("%d curves ask for an onset or an offset; fitted again", len(asked.names))
         again = rows = asking(study, asked)  # who asked for nothing does not later
+        part = study.take(again)
+        near = near_estimates(result, part, asked, again)
         # As large as the data; who asks for them again has them computed again.
         vars(result).pop("residuals", None)
-        new = _without_more_zeros(study.take(again), settings, alive, None, near[again])
+        new = _without_more_zeros(part, settings, alive, None, near)
         result = merged(study, result, again, new)
     return with_doubts(result, doubts)
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxtrachea.fitting.build import with_zeros
-from jaxtrachea.fitting.omitted_zeros import ZEROS, Asked, able_zeros, asking
+from jaxtrachea.fitting.omitted_zeros import ZEROS, Asked, able_zeros, asking, near_estimates
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.curve import Curve
@@ -79,7 +79,7 @@ class Noise(NamedTuple):
 
 
 def hidden_air(
-    study: Study, result: FitResult, asked: Asked, fit: Callable[[Study], FitResult]
+    study: Study, result: FitResult, asked: Asked, fit: Callable[[Study, np.ndarray], FitResult]
 ) -> Found:
     """Onsets and offsets without which lanes are not explained, and those that cannot be told.
 
@@ -87,7 +87,7 @@ def hidden_air(
         study: with a recipe, whose records were looked at.
         result: of it.
         asked: zeros that its residuals ask for.
-        fit: of some lanes, without scrutiny.
+        fit: of some lanes, without scrutiny, from a start near what they were and another.
     """
     out = Found(Asked(dict(asked.names), dict(asked.value)), {})
     if study.recipe is None or study.recipe.zeros is None:
@@ -111,7 +111,8 @@ def hidden_air(
             for t, c in enumerate(study.curves[k])
             if taken[k, :, t].any()
         }
-        tried = fit(with_zeros(study, names, lanes))
+        part = with_zeros(study, names, lanes)
+        tried = fit(part, near_estimates(result, part, Asked({}, {}), lanes))
         gain = _gain(study, result, lanes, tried, noise) - _EACH * taken[lanes].sum(axis=(1, 2))
         for row, lane in enumerate(lanes.tolist()):
             least = best[lane].gain if lane in best else EVIDENCE

@@ -365,10 +365,12 @@ def _unit(result: FitResult, lane: int, r: Float[np.ndarray, " m"], taken: int):
     return variance / float(share[0]), float(correlation[0])
 
 
-def near_estimates(result: FitResult, again: Study, asked: Asked) -> Float[np.ndarray, "lanes P"]:
-    """The estimates of a fit, with what further zeros promise, as starts of the study with them."""
+def near_estimates(
+    result: FitResult, again: Study, asked: Asked, lanes: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n P"]:
+    """The estimates of a fit, with what further zeros promise, as starts of its lanes with them."""
     out = np.full(again.lanes.lower.shape, np.nan)
-    for lane, unknowns in enumerate(again.unknowns):
+    for row, (lane, unknowns) in enumerate(zip(lanes.tolist(), again.unknowns, strict=True)):
         before = {(p.name, *of): i for i, (p, *of) in enumerate(result.study.unknowns[lane])}
         for i, (p, specimen, trial) in enumerate(unknowns):
             j = before.get((p.name, specimen, trial))
@@ -376,7 +378,7 @@ def near_estimates(result: FitResult, again: Study, asked: Asked) -> Float[np.nd
             if np.isnan(value) and j is not None:
                 value = float(result.value[lane, j])
             if np.isfinite(value) and (value > 0 or p.scale != "log"):
-                out[lane, i] = p.to_scaled(value)
+                out[row, i] = p.to_scaled(value)
     return np.clip(out, again.lanes.lower, again.lanes.upper)
 
 
