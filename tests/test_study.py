@@ -406,8 +406,6 @@ def test_little_work_is_compiled_without_optimisation(monkeypatch):
     on_cpu = jax.default_backend() == "cpu"
     assert [study.unoptimised(n) for n in (1, 16, 256, 257, 10_000)] == [on_cpu] * 3 + [False] * 2
     assert [study.evaluates_few(n) for n in (1, 4096, 4097)] == [on_cpu] * 2 + [False]
-    tenth = replace(study, shards=10)
-    assert [tenth.evaluates_few(n) for n in (409, 410)] == [on_cpu, False]
     long = study.lanes._replace(force=np.zeros((1, 1, 200_000)))
     assert not replace(study, lanes=long).unoptimised(1)
     assert not replace(study, joint=True).unoptimised(1)

@@ -93,7 +93,6 @@ class Study:
             these show them, mm, N, N/mm; NaN where they take none; None: no curve takes any.
         force_share: of the noise of forces, see `Noise`; None: it has none.
         shares: what the weights of the lanes have of it; None: nothing yet.
-        shards: parts of a run, of which these lanes are one, that are fitted alike.
         recipe: how it was built; None of a study that was changed since, or read from a file.
     """
 
@@ -111,7 +110,6 @@ class Study:
     record_zeros: Float[np.ndarray, "lanes T 3"] | None = None
     force_share: float | Literal["estimate"] | None = None
     shares: Shares | None = None
-    shards: int = 1
     # Not an argument, so that `dataclasses.replace` drops it: a changed study has none.
     recipe: Recipe | None = dataclasses.field(default=None, init=False)
 
@@ -262,11 +260,8 @@ class Study:
         return not batching.worth_optimising(count, self.bytes_per_lane)
 
     def evaluates_few(self, count: int) -> bool:
-        """As `unoptimised`, of `count` lanes that are evaluated a few times and not solved.
-
-        All shards of a run evaluate theirs by one program.
-        """
-        return self.unoptimised(-(-count * self.shards // batching.EVALUATIONS))
+        """As `unoptimised`, of `count` lanes that are evaluated a few times and not solved."""
+        return self.unoptimised(-(-count // batching.EVALUATIONS))
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""

@@ -21,7 +21,7 @@ from jaxtrachea.optimisation.programs import forget
 from jaxtrachea.results.read import read_again
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
-from jaxtrachea.runs.shards import divide, join, load, replaced, save, shard
+from jaxtrachea.runs.shards import divide, join, load, replaced, save
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
@@ -86,7 +86,7 @@ def fit_shards(
                     raise _Ended
                 progress(done, jobs)
 
-        result = fit(shard(part, shards[k], len(shards)), settings, tell)
+        result = fit(part.take(shards[k]), settings, tell)
         save(run.shard(k), run.manifest, shards[k], result)
         if next(saved) % SHARDS == 0:
             forget()

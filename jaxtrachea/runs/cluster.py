@@ -21,7 +21,7 @@ from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.runs.checkpoint import fitted_lanes, shards_of
 from jaxtrachea.runs.folder import RunFolder
 from jaxtrachea.runs.manifest import versions
-from jaxtrachea.runs.shards import save, shard
+from jaxtrachea.runs.shards import save
 
 #: Workers that a shard may lose before it is taken for the cause.
 MOST_LOST = 3
@@ -103,7 +103,7 @@ def fit_shards(
                 raise Lost(f"the cluster has had no worker for {PATIENCE:g} s")
             while waiting and len(under_way) < threads:
                 k = waiting.pop()
-                arguments = shard(part, shards[k], len(shards)), settings, prepare, software
+                arguments = part.take(shards[k]), settings, prepare, software
                 key = f"{run.manifest.id}-{k}-{lost[k]}"
                 under_way[client.submit(_fit_shard, *arguments, key=key, retries=0)] = k
             if under_way:

@@ -6,7 +6,6 @@ depend on when a run was stopped, nor on which process, device or thread fitted 
 """
 
 import contextlib
-import dataclasses
 import io
 import json
 import os
@@ -51,11 +50,6 @@ def lanes_per_shard(study: Study, starts: int) -> int:
 def divide(lanes: int, most: int) -> list[np.ndarray]:
     """Lanes of every shard: at most `most`, in order, as equal as can be."""
     return np.array_split(np.arange(lanes), -(-lanes // most))
-
-
-def shard(study: Study, lanes: np.ndarray, of: int) -> Study:
-    """The lanes of one of `of` shards, as a study to be fitted."""
-    return dataclasses.replace(study.take(lanes), shards=of)
 
 
 def slots(study: Study, free: float) -> int:
