@@ -199,8 +199,10 @@ def _built(curves: Sequence[Curve], recipe: Recipe, before: Study | None = None)
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
         noise=noise, weighting=weighting, tool_radius=recipe.tool_radius,
-        level=level_of(options), before=None if before is None else before.lanes,
+        level=level_of(options),
     )  # fmt: skip
+    if before is not None:  # of the same curves, in memory once
+        lanes = lanes._replace(displacement=before.lanes.displacement, force=before.lanes.force)
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
         lanes = lanes._replace(balance=weights)

@@ -173,7 +173,6 @@ class _Layout:
         level: of the model.
         curves: all of them.
         lanes: how many.
-        before: lanes of the same curves; None: the first ones.
     """
 
     parameters: Sequence[Parameter]
@@ -187,7 +186,6 @@ class _Layout:
     level: Level
     curves: Sequence[Curve]
     lanes: int
-    before: Lane | None
 
 
 def mean_lengths(groups: Sequence[Sequence[Curve]], *, joint: bool) -> Float[np.ndarray, " lanes"]:
@@ -233,7 +231,6 @@ def lanes_of(
     weighting: Weighting,
     tool_radius: float | None,
     level: Level,
-    before: Lane | None = None,
 ) -> Lane:
     """The lanes of a study, stacked along a leading axis.
 
@@ -244,8 +241,6 @@ def lanes_of(
         weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
         tool_radius: see `build.build_study`.
         level: of the model: what it observes, and whether it reads angles and the time.
-        before: lanes of the same curves with other unknowns: displacement and force are theirs, in
-            memory once.
     """
     every = [c for curves in groups for c in curves]
     lengths = [len(c.force) for c in every]
@@ -261,7 +256,6 @@ def lanes_of(
         level=level,
         curves=every,
         lanes=len(groups),
-        before=before,
     )
     whole = _blank(layout)
     for k, (curves, names) in enumerate(zip(groups, unknowns, strict=True)):
@@ -276,11 +270,11 @@ def lanes_of(
 def _blank(layout: _Layout) -> dict[str, Any]:
     """Padded float64 arrays of all lanes, without their curves."""
     L, T, N, P = layout.lanes, layout.trials, layout.samples, layout.unknowns
-    parameters, before = layout.parameters, layout.before
+    parameters = layout.parameters
     out: dict[str, Any] = {
         "s_c": np.full((L, T), float(layout.geometry.length) / 2),
-        "displacement": np.zeros((L, T, N)) if before is None else before.displacement,
-        "force": np.zeros((L, T, N)) if before is None else before.force,
+        "displacement": np.zeros((L, T, N)),
+        "force": np.zeros((L, T, N)),
         "precision": np.zeros((L, T, N)),
         "balance": np.ones((L, T)),
         "blend": None,
@@ -310,8 +304,7 @@ def _fill(
         n = len(curve.force)
         if curve.s_c is not None:
             lane["s_c"][t] = curve.s_c
-        if layout.before is None:
-            lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
+        lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
         if layout.level.relaxes and curve.time is not None:
             lane["time"][t] = curve.time[-1] - curve.time[0]
             lane["time"][t, :n] = curve.time - curve.time[0]
