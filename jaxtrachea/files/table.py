@@ -16,7 +16,6 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 #: Cells by name.
@@ -225,6 +224,12 @@ class Table(Sequence):
                 group[name] = [math.nan if cell is None else cell for cell in cells]
 
 
+class _Lines(list[str]):
+    """Lines, as a file that they are written to."""
+
+    write = list.append
+
+
 def write_csv(path: Path, rows: Iterable[Row]) -> None:
     """Write all cells; what is not there is empty, NaN of a number `nan`, formulas quoted.
 
@@ -235,9 +240,8 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
         rows: asked for one after the other.
     """
     names: dict[str, None] = {}
-    lines: list[str] = []
-    known: list[int] = []
-    writer = csv.writer(SimpleNamespace(write=lines.append))
+    lines, known = _Lines(), []
+    writer = csv.writer(lines)
     for row in rows:
         names |= dict.fromkeys(row)
         known.append(len(names))
