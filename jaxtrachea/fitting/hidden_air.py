@@ -32,6 +32,8 @@ _SPREAD = 1.2
 #: Such errors by which residuals exceed the noise where another fit is worth its time, and up to
 #: which they may where it explains the curves.
 _MISSES, _EXPLAINS = 1.5, 3.0
+#: Standard errors by which neighbouring residuals are correlated there.
+_FOLLOW = 2.0
 #: Gain in -2 ln L of each further zero beside `EVIDENCE`.
 _EACH = 4.0
 #: Records of a specimen that must show air, share of it by which their onsets may move, and
@@ -96,6 +98,9 @@ def hidden_air(
     noise = _against_records(study, result)
     misses = noise.ratio > 1 + _MISSES * noise.error
     misses[asking(study, asked)] = True
+    # What chance adds to residuals does not follow from sample to sample; what a model misses does.
+    samples = np.sum(study.lanes.precision > 0, axis=(1, 2))
+    misses &= np.nan_to_num(result.effective.correlation) * np.sqrt(samples) > _FOLLOW
     lanes = np.flatnonzero(able[:, _ONSET].any(axis=1) & misses & (noise.ratio < _FAR))
     ends = np.full(able.shape[::2], np.nan)
     for k in lanes.tolist():
