@@ -70,28 +70,6 @@ def test_unequal_and_correlated_errors_against_scipy():
     np.testing.assert_allclose(e.mean, mean, rtol=1e-9)
 
 
-def test_no_population_ends_in_the_lesser_of_two_maxima():
-    """Few specimens of unequal precision; SciPy from four starts. One of them ended 1.2 below."""
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        m, q = int(rng.integers(4, 14)), int(rng.integers(1, 4))
-        half = [rng.normal(size=(q, q + 1)) * rng.uniform(0.05, 0.6) for _ in range(m)]
-        C = np.array([a @ a.T for a in half])
-        middle, tau = rng.normal(size=q), rng.uniform(0, 0.5, q) * (rng.random(q) > 0.25)
-        y = np.array([rng.multivariate_normal(middle, np.diag(tau**2) + c) for c in C])
-
-        def against(tau2, C=C, y=y):
-            W = np.linalg.inv(C + np.diag(tau2))
-            total = W.sum(0)
-            r = y - np.linalg.solve(total, np.einsum("mij,mj->i", W, y))
-            value = np.linalg.slogdet(total)[1] - np.sum(np.linalg.slogdet(W)[1])
-            return 0.5 * (value + np.einsum("mi,mij,mj->", r, W, r))
-
-        starts = *(np.full(q, v) for v in (0.01, 0.1, 1.0)), np.var(y, axis=0)
-        best = min(minimize(against, v, bounds=[(0, None)] * q, tol=1e-13).fun for v in starts)
-        assert against(random_effects(y, C).sd ** 2) < best + 1e-6
-
-
 def test_an_estimate_that_does_not_exist_says_nothing():
     rng = np.random.default_rng(2)
     _, y, C = draw(rng, 8, np.array([0.3, 0.3]), np.zeros(2))

@@ -153,7 +153,9 @@ def with_doubts(result: FitResult, doubts: Doubts) -> FitResult:
         found = []
         for i, (p, name, trial) in enumerate(result.study.unknowns[lane]):
             none = Estimate(p.value, p.value, p.value) if p.auto else None
-            if (other := with_air.get((p.name, name, trial), none)) is not None:
+            other = with_air.get((p.name, name, trial), none)
+            known = not (result.undetermined[lane, i] or result.unexamined[lane, i])
+            if other is not None and known:
                 found.append(((lane, i), other))
         if all(
             result.lower[at] <= other.value <= result.upper[at]
@@ -163,9 +165,10 @@ def with_doubts(result: FitResult, doubts: Doubts) -> FitResult:
             continue
         minima[lane] = max(minima[lane], 2)
         for at, other in found:
-            low[at] = np.nanmin([low[at], result.lower[at], other.low])
-            high[at] = np.nanmax([high[at], result.upper[at], other.high])
-            end[at] = np.maximum(end[at], ProfileEnd.CLOSED)
+            low[at] = np.nanmin([low[at], result.lower[at], *other])
+            high[at] = np.nanmax([high[at], result.upper[at], *other])
+            open_ = not np.isfinite(other).all()  # the other reading does not know it
+            end[at] = np.maximum(end[at], ProfileEnd.FAILED if open_ else ProfileEnd.CLOSED)
     return dataclasses.replace(result, minima=minima, **out) if doubts else result
 
 
@@ -193,7 +196,8 @@ def _against_records(study: Study, result: FitResult) -> Noise:
     trials = np.array([len(lane) for lane in study.curves])
     noise = np.zeros(count.shape)
     noise[np.arange(count.shape[1]) < trials[:, None]] = study.recipe.zeros.noise
-    square, total = np.sum(count * noise**2, axis=1), np.sum(count, axis=1)
+    count = np.where(np.isnan(noise), 0, count)  # too few samples to tell theirs
+    square, total = np.nansum(count * noise**2, axis=1), np.sum(count, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return Noise(result.rms[:, 0] / np.sqrt(square / total), _SPREAD / np.sqrt(total))
 

@@ -119,9 +119,7 @@ def random_effects(
     covariance = covariance + absent[:, :, None] * np.eye(len(count))
     estimate = np.where(known, estimate, typical)
     # Where all is equal and exact, a variance of rounding keeps matrices regular.
-    starts = spread, np.zeros_like(spread)  # few specimens of unequal precision: two maxima
-    ends = [_maximum(start, estimate, covariance, 1e-24 * largest) for start in starts]
-    tau2, here = max(ends, key=lambda end: end[1].value)
+    tau2, here = _maximum(spread, estimate, covariance, 1e-24 * largest)
     variance = 1 / np.diagonal(here.information)
     free = tau2 > 0
     if free.sum() > 1:
