@@ -3,6 +3,8 @@
 Forces by an independent finite-element beam and Newton's method.
 """
 
+import dataclasses
+
 import beam_fem
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.build import build_study
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.hidden_air import hidden_air
+from jaxtrachea.fitting.hidden_air import Estimate, hidden_air, with_doubts
 from jaxtrachea.fitting.omitted_zeros import Asked
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.measurements.curve import Curve
@@ -22,6 +24,7 @@ pytestmark = pytest.mark.long
 TRUTH = {"EI_L": 300.0, "k_M": 0.5, "k_1": 1.2, "k_3": 0.08}
 PLACES, MARKED = (4.0, 8.0, 15.0, 35.0, 55.0, 75.0), (15.0, 35.0, 75.0)
 MARKERS = np.array([1, 3, 7])
+FIVE = (4.0, 12.0, 30.0, 55.0, 75.0)
 
 
 def law_of_model(d):
@@ -42,15 +45,15 @@ def press(s, depth, law=law_of_model):
     return F, F[:, None] * np.array(unit.w, float)
 
 
-def record(rng, name, s, air, offset, depth, noise, marked):
-    """51 samples from the end of the air on."""
-    way = np.linspace(-air, depth, 51)
+def record(rng, name, s, air, offset, depth, noise, marked=False, samples=51):
+    """A curve that begins with its air."""
+    way = np.linspace(-air, depth, samples)
     force, rings = press(s, way)
     seen = {}
     if marked:
-        at = rings[:, MARKERS] + 0.003 * rng.normal(size=(51, 3))
+        at = rings[:, MARKERS] + 0.003 * rng.normal(size=(samples, 3))
         seen = {"joint_rings": MARKERS, "joint_displacement": at}
-    force = force + offset + noise * rng.normal(size=51)
+    force = force + offset + noise * rng.normal(size=samples)
     return Curve(name, f"s{s:g}", s, 0.0, way + air, force, **seen)
 
 
@@ -132,14 +135,13 @@ def test_healthy_lanes_are_seldom_fitted_again():
     assert max(again, default=0) <= 5
 
 
-def specimen(seed, how, places, noise, depth, samples):
-    """Curves of one specimen of `TRUTH`; `how`: air at each place, mm."""
-    rng, curves = np.random.default_rng(seed), []
-    for s, air in zip(places, how, strict=True):
-        way = np.linspace(-air, depth, samples)
-        force = press(s, way)[0] + noise * rng.normal(size=samples)
-        curves.append(Curve("A", f"s{s:g}", s, 0.0, way + air, force))
-    return curves
+def specimen(seed, airs, noise, depth, samples):
+    """Curves of one specimen of `TRUTH`; `airs`: at each of `FIVE` places, mm."""
+    rng = np.random.default_rng(seed)
+    return [
+        record(rng, "A", s, air, 0.0, depth, noise, samples=samples)
+        for s, air in zip(FIVE, airs, strict=True)
+    ]
 
 
 def intervals(curves):
@@ -150,13 +152,10 @@ def intervals(curves):
     return dict(zip(names, of, strict=True)), names.count("onset"), int(result.minima[0])
 
 
-FIVE = (4.0, 12.0, 30.0, 55.0, 75.0)
-
-
 def test_air_of_all_curves_that_is_no_flat_beginning():
     """0.15 of 2.15 mm: four samples of 51, too few for `flat_until`; k_1 was 0.95 for 1.2."""
     for seed in range(3):
-        found, onsets, _ = intervals(specimen(seed, [0.15] * 5, FIVE, 0.017, 2.0, 51))
+        found, onsets, _ = intervals(specimen(seed, [0.15] * 5, 0.017, 2.0, 51))
         for name, truth in TRUTH.items():
             assert found[name].low < truth < found[name].high, (seed, name, found[name])
         assert onsets in (0, 5) or found["k_1"].verdict != "identifiable"
@@ -167,8 +166,41 @@ def test_air_that_nothing_speaks_for_is_in_the_intervals():
     airs = [0.25, 0.0, 0.25, 0.0, 0.25]
     apart = 0
     for seed in range(4):
-        found, _, minima = intervals(specimen(seed, airs, FIVE, 0.15, 4.0, 31))
+        found, _, minima = intervals(specimen(seed, airs, 0.15, 4.0, 31))
         for name, truth in TRUTH.items():
             assert found[name].low < truth < found[name].high, (seed, name, found[name])
         apart += minima > 1
     assert apart
+
+
+def test_a_short_record_does_not_keep_the_others_from_being_read_with_air():
+    """Of five samples nothing is known of the noise; k_1 was 0.88 for 1.2, "identifiable"."""
+    curves = specimen(0, [0.15] * 5, 0.017, 2.0, 51)
+    long = curves[2]
+    few = Curve("A", "few", 30.0, 0.0, long.displacement[10::10][:5], long.force[10::10][:5])
+    found, _, minima = intervals([*curves, few])
+    assert found["k_1"].low < TRUTH["k_1"] < found["k_1"].high
+    assert minima > 1
+
+
+def test_intervals_hold_both_readings_where_both_are_known():
+    curves = specimen(1, [0.0] * 5, 0.02, 2.0, 51)
+    result = fit(build_study(curves, table_1()), Settings(starts=2))
+    i = [p.name for p, _, _ in result.study.unknowns[0]].index("k_1")
+    p, name, trial = result.study.unknowns[0][i]
+    value, low = float(result.value[0, i]), float(result.lower[0, i])
+
+    def read(*other, **changes):
+        doubts = {0: {(p.name, name, trial): Estimate(*(v * value for v in other))}}
+        return with_doubts(dataclasses.replace(result, **changes), doubts)
+
+    both = read(1.9, 2.0, 2.1)
+    assert both.evidence_low[0, i] == low
+    assert both.evidence_high[0, i] == 2.1 * value
+    assert both.minima[0] == 2
+    unknown = read(np.nan, 2.0, np.nan)
+    assert unknown.evidence_high[0, i] == 2.0 * value
+    assert assess(unknown, 0, i).verdict == "inconclusive"
+    for field in ("unexamined", "undetermined"):
+        kept = read(1.9, 2.0, 2.1, **{field: np.ones(result.theta.shape, bool)})
+        assert kept.evidence_end[0, i].tolist() == [-1, -1], field

@@ -245,8 +245,7 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
     for row in rows:
         names |= dict.fromkeys(row)
         known.append(len(names))
-        cells = map(row.get, names)
-        writer.writerow([quoted(cell) if isinstance(cell, str) else cell for cell in cells])
+        writer.writerow(quoted(row.get(name)) for name in names)
     writer.writerow(map(quoted, names))
     head = lines.pop()
     with path.open("w", encoding="utf-8", newline="") as stream:

@@ -14,8 +14,6 @@ from jaxtrachea.files.atomic import is_utf8
 Spec = TypeVar("Spec", bound=BaseModel)
 #: Longest specification that is read.
 MAX_BYTES = 2**20
-#: Names of data files end so.
-DATA = (".csv", ".tsv", ".txt", ".dat")
 #: Problems that are listed one by one.
 MAX_LINES = 10
 #: Names of the two ways to write `trachea.rings`; pydantic puts them into the place of an error.
@@ -66,10 +64,10 @@ def read_tables(path: Path, called: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        if path.suffix.lower() in DATA:
+        if path.suffix.lower() != ".toml":
             raise SpecError(
-                "a data file", place=str(path), expected=f"a TOML {called}",
-                cure=f"`jaxtrachea init {path}` writes a fit specification for it",
+                "not TOML", place=str(path), expected=f"a TOML {called}",
+                cure=f"for a data file `jaxtrachea init {path}` writes a fit specification",
             ) from None  # fmt: skip
         raise SpecError(f"not valid TOML: {_at_line(error, text)}", place=str(path)) from None
     except RecursionError:

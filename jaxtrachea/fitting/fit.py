@@ -101,7 +101,9 @@ def with_omitted_zeros(
 ) -> FitResult:
     """The fit with the onsets and force offsets that its residuals ask for.
 
-    Their lanes are fitted again. A study that was changed since it was built stays as it is.
+    Their lanes are fitted again. Of lanes that air explains as well, without anything else that
+    speaks for it, intervals hold both readings (`hidden_air`). A study that was changed since it
+    was built stays as it is.
 
     Args:
         study: as `build_study` made it.

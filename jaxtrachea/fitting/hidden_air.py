@@ -3,8 +3,9 @@
 A record by itself cannot tell some air from a press whose law begins soft: it then takes no onset.
 Where that is wrong the whole specimen is: the other curves follow, and the fit ends in a minimum
 from which no small change asks for an onset, or from which an offset seems to be missing
-(`omitted_zeros`). So a specimen whose residuals are larger than the noise of its records, or ask
-for a zero, is fitted with the onsets of all curves that may begin in air, and with offsets, too.
+(`omitted_zeros`). So a specimen whose residuals are correlated, and larger than the noise of its
+records or asking for a zero, is fitted with the onsets of all curves that may begin in air, and
+with offsets, too.
 Where either explains its curves to their noise, the likelihood gains more than so many unknowns do
 by chance, and onsets lie where air may be, there are two readings. A law that is missing from the
 model may look like air. So the zeros are taken where witnesses agree: two other records that show
@@ -167,8 +168,8 @@ def with_doubts(result: FitResult, doubts: Doubts) -> FitResult:
         for at, other in found:
             low[at] = np.nanmin([low[at], result.lower[at], *other])
             high[at] = np.nanmax([high[at], result.upper[at], *other])
-            open_ = not np.isfinite(other).all()  # the other reading does not know it
-            end[at] = np.maximum(end[at], ProfileEnd.FAILED if open_ else ProfileEnd.CLOSED)
+            unknown = not np.isfinite(other).all()  # to the other reading
+            end[at] = np.maximum(end[at], ProfileEnd.FAILED if unknown else ProfileEnd.CLOSED)
     return dataclasses.replace(result, minima=minima, **out) if doubts else result
 
 

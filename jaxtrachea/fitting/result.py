@@ -85,14 +85,16 @@ class FitResult:
         undetermined: unknowns that the structure leaves open (`structure`); (lanes, P).
         unexamined: unknowns that gave cause to look further than the local error, and nobody did:
             in a joint fit, or without scrutiny; (lanes, P).
-        evidence_low: 95 % interval by profile and other minima, in the parameter's unit: -inf
+        evidence_low: 95 % interval by profile, other minima and, where curves may hide air
+            (`hidden_air`), the fit with it, in the parameter's unit: -inf
             (scale `log`: 0) where open, NaN where there was no cause to look; where an end is
             `FAILED`, as far as the cost is known to stay below the threshold; (lanes, P).
         evidence_high: (lanes, P).
         evidence_end: `ProfileEnd` of its lower and upper end, -1 where there is none;
             (lanes, P, 2).
         minima: minima that fit within the likelihood's threshold, the best one included; those
-            that differ from it in an unknown that the structure does not leave open; (lanes,).
+            that differ from it in an unknown that the structure does not leave open; 2 at least
+            where a fit with hidden air says something else; (lanes,).
         origin: where it was read from.
         stored_residuals: of a fit that was read, so that the model is not evaluated again.
     """

@@ -25,8 +25,8 @@ from jaxtrachea.runs.shards import divide, join, load, replaced, save
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
-#: Shards after which their programs are let go: those of few lanes come to 200 MB, and what all
-#: lanes want is loaded again in a second.
+#: Shards after which their programs are let go: those of few lanes come to 200 MB in so many, and
+#: what all lanes want is loaded again in a second.
 SHARDS = 12
 #: Seconds between two looks at the threads.
 LOOK = 0.02
