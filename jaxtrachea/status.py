@@ -121,8 +121,8 @@ class PredictionStatus(_Described):
     )
     OTHER_ZERO = (
         4,
-        "predicted, but the record shows a zero that the fit holds at 0: its displacement or force "
-        "is counted from elsewhere",
+        "predicted, but a record has, or may have, a zero that the fit holds at 0: displacement or "
+        "force is counted from elsewhere",
     )
     EXTRAPOLATED = (
         5,

@@ -90,7 +90,7 @@ def test_page_names_every_dataset(result, tmp_path):
     with h5py.File(tmp_path / "r.h5") as file:
         file.visititems(lambda name, item: found.__setitem__(name, getattr(item, "shape", None)))
         assert json.loads(file.attrs["provenance"]) == {"a": 1}
-        assert (file.attrs["schema"], file.attrs["schema_version"]) == ("jaxtrachea-results", 5)
+        assert (file.attrs["schema"], file.attrs["schema_version"]) == ("jaxtrachea-results", 6)
         assert json.loads(file["unknowns"].attrs["units"])["k_3"] == "N/mm^3"
     shapes = {name: shape for name, shape in found.items() if shape is not None}
     assert sorted(shapes) == sorted(columns("## results.h5"))

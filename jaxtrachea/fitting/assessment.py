@@ -57,7 +57,8 @@ class Assessment(NamedTuple):
         low: 95 % interval in the parameter's unit, within its bounds: by profile and other minima
             where there is such evidence, else local, each side as many times as long on the scaled
             coordinate as correlated residuals make it (`Effective.growth`); the bound where open.
-            Where an end is `FAILED`, the local one, if it reaches further than what is known.
+            Where an end is `FAILED`, the local one, if it reaches further than what is known. With
+            that of a fit with hidden air, where there is one (`FitResult.with_air`).
         high: likewise.
         ends: `ProfileEnd` of the two; None where the interval is local.
         error: relative error that the verdict rests on: the longer side of the interval over that
@@ -100,13 +101,18 @@ def _assess(result: Any, lane: int, i: int, profiles: Intervals | None) -> Asses
         error = _longer_side(result, lane, i, plain_low, plain_high)
         error /= float(result.uncertainty.half_width[lane])
     error *= growth
+    low, high = _grown(result, lane, i, plain_low, plain_high, growth)
+    with_air = result.with_air[lane, i]
+    if not np.isnan(with_air).any():
+        low, high = float(np.fmin(low, with_air[0])), float(np.fmax(high, with_air[1]))
+        side = _longer_side(result, lane, i, low, high)
+        error = max(error, side / float(result.uncertainty.half_width[lane]))
     if unsampled_time(result, lane, i):
         error = np.inf
     word = verdict(
         error, structural=structural, held=held, ends=ends, misses=misses,
         unseen=ends is None and bool(result.unexamined[lane, i]),
     )  # fmt: skip
-    low, high = _grown(result, lane, i, plain_low, plain_high, growth)
     open_ = ends is not None and ProfileEnd.OPEN in ends
     factor = np.nan if structural or open_ or misses else float(result.effective.factor[lane])
     return Assessment(

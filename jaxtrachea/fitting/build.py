@@ -18,6 +18,7 @@ from jaxtrachea.fitting.lanes import (
     curve_weights,
     group,
     lanes_of,
+    recorded,
     unknowns_of,
     weighed_by_depth,
 )
@@ -201,7 +202,9 @@ def _built(curves: Sequence[Curve], recipe: Recipe, before: Study | None = None)
         noise=noise, weighting=weighting, tool_radius=recipe.tool_radius,
         level=level_of(options),
     )  # fmt: skip
-    if before is not None:  # of the same curves, in memory once
+    if before is None:
+        lanes = recorded(groups, lanes)
+    else:  # of the same curves, in memory once
         lanes = lanes._replace(displacement=before.lanes.displacement, force=before.lanes.force)
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
@@ -262,9 +265,12 @@ def _force_share(
         return noise.force_share or None
     if known or model.options.coupling == "total":
         return None
-    touch = first_touch_of(lanes, parameters, change_points)[..., None]
-    depth = depths(np.asarray(lanes.displacement), touch, model.options)
-    deepest = np.max(np.abs(depth), where=np.asarray(lanes.precision) > 0, initial=0)
+    deepest = 0.0
+    touch = first_touch_of(lanes, parameters, change_points)
+    for t, of_lanes in enumerate(touch.T):  # one after the other: they are as large as the data
+        depth = depths(np.asarray(lanes.displacement[:, t]), of_lanes[:, None], model.options)
+        seen = np.asarray(lanes.precision[:, t]) > 0
+        deepest = np.max(np.abs(depth), where=seen, initial=deepest)
     return None if deepest <= DEEP * float(model.geometry.radius) else "estimate"
 
 
@@ -315,7 +321,8 @@ def _from_touch(
         lanes = within_reach(lanes._replace(blend=width), parameters)
         seen = np.where(own, corners.onset, np.nan)
         if found is not None and parameters[column].auto:
-            first = np.min(np.where(lanes.precision > 0, lanes.displacement, np.inf), axis=2)
+            weighed = lanes.precision > 0
+            first = np.min(lanes.displacement, axis=2, where=weighed, initial=np.inf)
             before = found[..., 0] <= first
             seen = np.where(before, found[..., 0], seen)
             found[..., 0] = np.where(np.isnan(found[..., 0]), np.nan, seen)

@@ -45,7 +45,8 @@ def evaluated(study: Study) -> FitResult:
         uncertainty=_no_uncertainty(half), undetermined=none.astype(bool),
         unexamined=none.astype(bool),
         evidence_low=none, evidence_high=none, evidence_end=np.zeros((lanes, 0, 2), int),
-        minima=np.ones(lanes, int), iterations=np.zeros(lanes, int), tried=np.ones(lanes, int),
+        with_air=np.zeros((lanes, 0, 2)), minima=np.ones(lanes, int),
+        iterations=np.zeros(lanes, int), tried=np.ones(lanes, int),
     )  # fmt: skip
 
 

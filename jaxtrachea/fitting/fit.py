@@ -355,7 +355,8 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         uncertainty=u, undetermined=structure.undetermined,
         unexamined=np.zeros(theta.shape, bool), evidence_low=np.full(theta.shape, np.nan),
         evidence_high=np.full(theta.shape, np.nan),
-        evidence_end=np.full((*theta.shape, 2), -1), minima=np.ones(len(theta), int),
+        evidence_end=np.full((*theta.shape, 2), -1), with_air=np.full((*theta.shape, 2), np.nan),
+        minima=np.ones(len(theta), int),
     )  # fmt: skip
 
 

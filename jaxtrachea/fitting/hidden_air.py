@@ -10,7 +10,7 @@ Where either explains its curves to their noise, the likelihood gains more than 
 by chance, and onsets lie where air may be, there are two readings. A law that is missing from the
 model may look like air. So the zeros are taken where witnesses agree: two other records that show
 air and whose onsets stay there, or markers, which stand still in air. Else the fit stays as it is,
-and its intervals hold those of the other reading (`with_doubts`).
+and its intervals hold those of the other reading (`assessment`).
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.build import with_zeros
 from jaxtrachea.fitting.omitted_zeros import ZEROS, Asked, able_zeros, asking, near_estimates
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.record_zeros import EVIDENCE, flat_until
-from jaxtrachea.status import ProfileEnd
 
 #: Relative error of the noise of n samples, as a record tells it, times sqrt(n).
 _SPREAD = 1.2
@@ -49,17 +49,9 @@ _ONSET = ZEROS.index("onset")
 Onsets = Mapping[tuple[str, str], float]
 
 
-class Estimate(NamedTuple):
-    """With its 95 % interval."""
-
-    low: float
-    value: float
-    high: float
-
-
-#: By name, specimen and trial; and these of lanes.
-Estimates = dict[tuple[str, str, str], Estimate]
-Doubts = dict[int, Estimates]
+#: Ends of 95 % intervals by name, specimen and trial; and these of lanes.
+Intervals = dict[tuple[str, str, str], tuple[float, float]]
+Doubts = dict[int, Intervals]
 
 
 class Found(NamedTuple):
@@ -67,7 +59,7 @@ class Found(NamedTuple):
 
     Attributes:
         asked: zeros that are taken.
-        doubts: what would come out of lanes that air explains, too, but nothing else speaks for.
+        doubts: what comes out of lanes that air explains, too, but nothing else speaks for.
     """
 
     asked: Asked
@@ -126,7 +118,7 @@ def hidden_air(
                 best[lane] = _Reading(float(gain[row]), names, tried, row)
     for lane, (_, names, tried, row) in best.items():
         if not _witnessed(study, lane, tried, row):
-            out.doubts[lane] = _estimates(tried, row)
+            out.doubts[lane] = _intervals(tried, row)
             continue
         for key in [(c.specimen, c.trial) for c in study.curves[lane]]:
             out.asked.names.pop(key, None)
@@ -146,40 +138,23 @@ class _Reading(NamedTuple):
 
 
 def with_doubts(result: FitResult, doubts: Doubts) -> FitResult:
-    """A fit whose intervals hold those of lanes with air, where these say something else."""
-    out = {n: getattr(result, n).copy() for n in ("evidence_low", "evidence_high", "evidence_end")}
-    low, high, end = out.values()
-    minima = result.minima.copy()
-    for lane, with_air in doubts.items():
-        found = []
-        for i, (p, name, trial) in enumerate(result.study.unknowns[lane]):
-            none = Estimate(p.value, p.value, p.value) if p.auto else None
-            other = with_air.get((p.name, name, trial), none)
-            known = not (result.undetermined[lane, i] or result.unexamined[lane, i])
-            if other is not None and known:
-                found.append(((lane, i), other))
-        if all(
-            result.lower[at] <= other.value <= result.upper[at]
-            and other.low <= result.value[at] <= other.high
-            for at, other in found
-        ):
-            continue
-        minima[lane] = max(minima[lane], 2)
-        for at, other in found:
-            low[at] = np.nanmin([low[at], result.lower[at], *other])
-            high[at] = np.nanmax([high[at], result.upper[at], *other])
-            unknown = not np.isfinite(other).all()  # to the other reading
-            end[at] = np.maximum(end[at], ProfileEnd.FAILED if unknown else ProfileEnd.CLOSED)
-    return dataclasses.replace(result, minima=minima, **out) if doubts else result
+    """A fit that knows the intervals of lanes with air (`FitResult.with_air`)."""
+    with_air = result.with_air.copy()
+    for lane, found in doubts.items():
+        for i, (p, *of) in enumerate(result.study.unknowns[lane]):
+            none = (p.value, p.value) if p.auto else (np.nan, np.nan)
+            with_air[lane, i] = found.get((p.name, *of), none)
+    return dataclasses.replace(result, with_air=with_air) if doubts else result
 
 
-def _estimates(tried: FitResult, row: int) -> Estimates:
-    """Estimates of a lane."""
-    low, value, high = (v[row].tolist() for v in (tried.lower, tried.value, tried.upper))
-    return {
-        (p.name, name, trial): Estimate(low[i], value[i], high[i])
-        for i, (p, name, trial) in enumerate(tried.study.unknowns[row])
-    }
+def _intervals(tried: FitResult, row: int) -> Intervals:
+    """95 % intervals of a lane; without ends where it does not know them."""
+    out = {}
+    for i, (p, name, trial) in enumerate(tried.study.unknowns[row]):
+        found = assess(tried, row, i)
+        known = np.isfinite([found.low, found.high]).all()
+        out[p.name, name, trial] = (found.low, found.high) if known else (-np.inf, np.inf)
+    return out
 
 
 def _latest(curve: Curve) -> float:

@@ -232,7 +232,7 @@ def lanes_of(
     tool_radius: float | None,
     level: Level,
 ) -> Lane:
-    """The lanes of a study, stacked along a leading axis.
+    """The lanes of a study, stacked along a leading axis, without their samples (`recorded`).
 
     Args:
         groups: curves of each lane.
@@ -257,14 +257,20 @@ def lanes_of(
         curves=every,
         lanes=len(groups),
     )
-    whole = _blank(layout)
+    whole = _blank(layout) | {"precision": _precision(layout, groups)}
     for k, (curves, names) in enumerate(zip(groups, unknowns, strict=True)):
         _fill({n: v if v is None else v[k] for n, v in whole.items()}, layout, curves, names)
-    others = _others(layout, groups, whole["precision"])
-    first = whole["precision"].flat[0]
-    if (whole["precision"] == first).all():  # one number for all takes no room
-        whole["precision"] = np.broadcast_to(first, whole["precision"].shape)
-    return Lane(others=others, **whole)
+    return Lane(others=_others(layout, groups, whole["precision"]), **whole)
+
+
+def recorded(groups: Sequence[Sequence[Curve]], lanes: Lane) -> Lane:
+    """Lanes with displacement, mm, and force, N, of their curves."""
+    displacement, force = np.zeros(lanes.precision.shape), np.zeros(lanes.precision.shape)
+    for k, curves in enumerate(groups):
+        for t, curve in enumerate(curves):
+            at = k, t, slice(len(curve.force))
+            displacement[at], force[at] = curve.displacement, curve.force
+    return lanes._replace(displacement=displacement, force=force)
 
 
 def _blank(layout: _Layout) -> dict[str, Any]:
@@ -275,7 +281,6 @@ def _blank(layout: _Layout) -> dict[str, Any]:
         "s_c": np.full((L, T), float(layout.geometry.length) / 2),
         "displacement": np.zeros((L, T, N)),
         "force": np.zeros((L, T, N)),
-        "precision": np.zeros((L, T, N)),
         "balance": np.ones((L, T)),
         "blend": None,
         "value": np.tile(np.array([p.value for p in parameters], np.float64), (L, T, 1)),
@@ -291,11 +296,26 @@ def _blank(layout: _Layout) -> dict[str, Any]:
     return out
 
 
+def _precision(layout: _Layout, groups: Sequence[Sequence[Curve]]) -> np.ndarray:
+    """Of forces, 1 / N, or 1 where they have no sigma; 0 where there is no sample."""
+    room, force = (layout.lanes, layout.trials, layout.samples), layout.noise.force
+    usual = 1.0 if force is None else 1 / force
+    full = all(len(lane) == room[1] for lane in groups)
+    if full and all(len(c.force) == room[2] and c.sigma is None for c in layout.curves):
+        return np.broadcast_to(usual, room)  # one number for all takes no room
+    out = np.zeros(room)
+    for k, curves in enumerate(groups):
+        for t, curve in enumerate(curves):
+            weight = usual if curve.sigma is None else 1 / np.asarray(curve.sigma)
+            out[k, t, : len(curve.force)] = weight
+    return out
+
+
 def _fill(
     lane: dict[str, Any], layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown]
 ) -> None:
     """Put the curves and unknowns of one lane into its arrays."""
-    parameters, noise = layout.parameters, layout.noise
+    parameters = layout.parameters
     place = {key: i for i, key in enumerate(unknowns)}
     for i, (p, _, _) in enumerate(unknowns):
         lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
@@ -304,13 +324,10 @@ def _fill(
         n = len(curve.force)
         if curve.s_c is not None:
             lane["s_c"][t] = curve.s_c
-        lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
         if layout.level.relaxes and curve.time is not None:
             lane["time"][t] = curve.time[-1] - curve.time[0]
             lane["time"][t, :n] = curve.time - curve.time[0]
             lane["rising"][t, slice(*(curve.rise or (0, n)))] = 1
-        sigma = curve.sigma if curve.sigma is not None else noise.force
-        lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
         for j, p in enumerate(parameters):
             if not p.fixed:
                 lane["index"][t, j] = place.get(_key(p, curve), -1)

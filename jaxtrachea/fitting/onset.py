@@ -72,8 +72,7 @@ def touches(
     displacement, force, precision = (
         np.reshape(v, (-1, samples)) for v in (lanes.displacement, lanes.force, precision)
     )
-    if slope is not None:
-        force = force - np.nan_to_num(slope).reshape(-1, 1) * displacement
+    without = np.zeros(shape) if slope is None else np.nan_to_num(slope)
     column = {p.name: j for j, p in enumerate(parameters)}
     index = np.asarray(lanes.index).reshape(-1, len(parameters))
     own = index[:, column["force_offset"]] >= 0
@@ -84,7 +83,9 @@ def touches(
             offset = None
             if known is not None:
                 offset = np.full(len(rows), parameters[column[known]].value)
-            found = first_touch(displacement[rows], force[rows], precision[rows] > 0, offset)
+            way = displacement[rows]
+            rest = force[rows] - without.reshape(-1, 1)[rows] * way
+            found = first_touch(way, rest, precision[rows] > 0, offset)
             for whole, part in zip(out, found, strict=True):
                 whole[rows] = part
     return FirstTouch(*(v.reshape(shape) for v in out))
@@ -171,8 +172,8 @@ def within_reach(lanes: Lane, parameters: Sequence[Parameter]) -> Lane:
     if p.scale != "linear" or (p.lower, p.upper) != (usual.lower, usual.upper):
         return lanes
     seen = lanes.precision > 0
-    first = np.min(np.where(seen, lanes.displacement, np.inf), axis=2)
-    last = np.max(np.where(seen, lanes.displacement, -np.inf), axis=2)
+    first = np.min(lanes.displacement, axis=2, where=seen, initial=np.inf)
+    last = np.max(lanes.displacement, axis=2, where=seen, initial=-np.inf)
     lower, upper = lanes.lower.copy(), lanes.upper.copy()
     for lane, row in enumerate(lanes.index[:, :, column]):
         for i in np.unique(row[row >= 0]):

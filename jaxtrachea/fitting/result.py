@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 #: Fields of a result whose second axis is that of a lane's unknowns.
 OF_UNKNOWNS = (
     "theta", "value", "standard_error", "lower", "upper", "relative_se", "at_bound",
-    "undetermined", "unexamined", "evidence_low", "evidence_high", "evidence_end",
+    "undetermined", "unexamined", "evidence_low", "evidence_high", "evidence_end", "with_air",
 )  # fmt: skip
 
 
@@ -85,16 +85,17 @@ class FitResult:
         undetermined: unknowns that the structure leaves open (`structure`); (lanes, P).
         unexamined: unknowns that gave cause to look further than the local error, and nobody did:
             in a joint fit, or without scrutiny; (lanes, P).
-        evidence_low: 95 % interval by profile, other minima and, where curves may hide air
-            (`hidden_air`), the fit with it, in the parameter's unit: -inf
+        evidence_low: 95 % interval by profile and other minima, in the parameter's unit: -inf
             (scale `log`: 0) where open, NaN where there was no cause to look; where an end is
             `FAILED`, as far as the cost is known to stay below the threshold; (lanes, P).
         evidence_high: (lanes, P).
         evidence_end: `ProfileEnd` of its lower and upper end, -1 where there is none;
             (lanes, P, 2).
+        with_air: 95 % interval of the fit with air that curves may hide and nothing else speaks
+            for (`hidden_air`), in the parameter's unit, as `assess` gives it there: verdicts and
+            intervals hold it, too; NaN where there is no such fit; (lanes, P, 2).
         minima: minima that fit within the likelihood's threshold, the best one included; those
-            that differ from it in an unknown that the structure does not leave open; 2 at least
-            where a fit with hidden air says something else; (lanes,).
+            that differ from it in an unknown that the structure does not leave open; (lanes,).
         origin: where it was read from.
         stored_residuals: of a fit that was read, so that the model is not evaluated again.
     """
@@ -123,6 +124,7 @@ class FitResult:
     evidence_low: np.ndarray
     evidence_high: np.ndarray
     evidence_end: np.ndarray
+    with_air: np.ndarray
     minima: np.ndarray
     origin: Origin = Origin()
     stored_residuals: Prediction | None = None

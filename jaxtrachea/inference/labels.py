@@ -159,4 +159,10 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
         said.append("inconclusive: only the local error was looked at; --profile looks further")
     if result.minima[lane] > 1:
         said.append("other parameter sets fit equally well")
+    if not np.isnan(result.with_air[lane]).all():
+        said.append(
+            "curves may begin in air, which would fit better, but nothing else speaks for it: "
+            "intervals hold both; onset = {} in [parameters] takes the air, "
+            "onset = { fixed = 0 } excludes it"
+        )
     return "; ".join(said)

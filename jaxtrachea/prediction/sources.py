@@ -197,6 +197,9 @@ def _taken(stored: FitResult, specimen, trial, lane: int, index, own, note: str)
         if held:
             status = PredictionStatus.AT_BOUND
             said.append(f"{', '.join(held)} held")
+    if not np.isnan(stored.with_air[lane]).all():
+        status = PredictionStatus.OTHER_ZERO
+        said.append("curves of the fit may begin in air, which it does not take")
     return CurveParameters(
         specimen=specimen,
         trial=trial,

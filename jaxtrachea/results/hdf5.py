@@ -19,7 +19,7 @@ from jaxtrachea.results.arrays import PLACES, arrays_of
 from jaxtrachea.status import FitStatus
 
 SCHEMA = "jaxtrachea-results"
-VERSION = 5
+VERSION = 6
 
 
 def write_hdf5(
