@@ -1,4 +1,4 @@
-"""A finished fit read back from its results.h5 (schema 5), bit for bit.
+"""A finished fit read back from its results.h5, bit for bit.
 
 Through the audited door for files that nobody vouches for (`readers.safe_hdf5`).
 """
