@@ -71,6 +71,37 @@ def test_derivatives_by_the_data_of_sections():
     np.testing.assert_allclose(products, (apart[0] - apart[1]) / (2 * h), rtol=1e-5)
 
 
+def test_what_the_data_leave_open_does_not_move():
+    """One depth tells k_1 d + k_3 d^3 alone. Derivatives were the inverse of a rounding."""
+    d, force = 2.0, np.array([3.5, 3.1, 3.6])
+    curve = Curve("one", "one", 20.0, 0.0, np.full(3, d), force)
+    held = {"fixed": True, "value": 0.0}
+    table = {"k_1": {}, "k_3": {}, "onset": held, "force_offset": held}
+    options = Options(coupling="total", contact="bonded")
+    study = build_study([curve], TUBE, options, table, noise=Noise(force=0.1))
+    assert [(p.name, p.scale) for p in study.model.free] == [("k_1", "log"), ("k_3", "linear")]
+    lane, start = lane_of(study, 0), jnp.array([0.0, 0.05])
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def fitted(force):
+        def theta(force):
+            found = estimate(study.model, start, lane._replace(force=force), jnp.ones(2))
+            return found.theta, found
+
+        return jax.jacrev(theta, has_aux=True)(force)
+
+    by_force, found = fitted(lane.force)
+    assert found.status == FitStatus.UNIDENTIFIABLE
+    step = study.model.free[1].step
+    k_1, k_3 = np.exp(found.theta[0]), step * found.theta[1]
+    np.testing.assert_allclose(k_1 * d + k_3 * d**3, force.mean(), rtol=1e-6)
+    slope = np.array([k_1 * d, step * d**3])  # of the force by theta
+    by_force = by_force.reshape(2, 3)
+    np.testing.assert_allclose(slope @ by_force, np.full(3, 1 / 3), rtol=1e-6)
+    across = np.array([-slope[1], slope[0]])
+    np.testing.assert_allclose(across @ by_force / np.linalg.norm(slope), 0, atol=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_outside_of_jit_few_programs_are_compiled():

@@ -2,7 +2,9 @@
 
 At the minimum the gradient of the cost vanishes, g(theta, data) = 0, hence
 d theta = -H^-1 (dg / d data) d data with the full Hessian H, curvature of the model included. An
-unknown on its bound moves with the bound alone. Forward and reverse mode, any order, `jit`, `vmap`.
+unknown on its bound moves with the bound alone. Along what the data leave open H is singular: the
+fit does not move there, nor does its derivative. Forward and reverse mode, any order, `jit`,
+`vmap`.
 """
 
 import functools
@@ -13,11 +15,21 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._numerics import epsilon
 from jaxtrachea.fitting.cost import LaneCost, evaluate
+from jaxtrachea.fitting.covariance import SINGULAR
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.trust_region import RUNNING, State, Tolerances, initial_state, iterate
+from jaxtrachea.optimisation.trust_region import (
+    RUNNING,
+    State,
+    Tolerances,
+    active_set,
+    initial_state,
+    iterate,
+)
+from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -26,7 +38,9 @@ class Estimate(NamedTuple):
 
     Attributes:
         theta: unknowns in scaled coordinates; (P,).
-        status: `FitStatus`; where it is not CONVERGED, derivatives mean nothing.
+        status: `FitStatus`; UNIDENTIFIABLE where the data leave a combination of unknowns open: it
+            stays where the start has it, and its derivative is 0. Where it is neither this nor
+            CONVERGED, derivatives mean nothing.
     """
 
     theta: Float[Array, " P"]
@@ -61,7 +75,11 @@ def estimate(
     tube = jax.tree.map(jnp.asarray, model.geometry if geometry is None else geometry)
     data = (lane, sigma, tube)
     state = _solve(model, tolerances, *jax.lax.stop_gradient((start, data)))
-    return Estimate(_implicit(model, state.theta, data), state.status)
+    held = active_set(state.theta, state.point.gradient, lane)
+    opened = jnp.any(_left_open(state.point.hessian, ~held) != 0)
+    lost = opened & (state.status == FitStatus.CONVERGED)
+    status = jnp.where(lost, jnp.int8(FitStatus.UNIDENTIFIABLE), state.status)
+    return Estimate(_implicit(model, state.theta, data), status)
 
 
 def gradient(
@@ -128,7 +146,24 @@ def _implicit_jvp(model: FitModel, primals, tangents):
     rhs = jnp.where(free, -d_g - jnp.sum(H * pushed[None], axis=1), pushed)
     both = free[:, None] & free[None]
     matrix = jnp.where(both, H, jnp.eye(len(theta), dtype=H.dtype))
-    return theta, jnp.linalg.solve(matrix, rhs)
+    opened = _left_open(H, free)
+    return theta, jnp.linalg.solve(matrix + opened, rhs - opened @ rhs)
+
+
+def _left_open(H: Float[Array, "P P"], free) -> Float[Array, "P P"]:
+    """Projection onto combinations of what is free that the curvature does not tell from a plane.
+
+    A constant to derivatives, as the eigenvectors of a matrix with equal eigenvalues have none.
+    """
+    H = jax.lax.stop_gradient(H)
+    H = jnp.where(free[:, None] & free[None], H, 0)
+    top = jnp.max(jnp.abs(jnp.diagonal(H)))
+    held = jnp.where(free, 0, jnp.where(top > 0, top, 1))
+    values, vectors = jnp.linalg.eigh(H + jnp.diag(held))
+    size = jnp.abs(values)
+    flat = size <= max(SINGULAR**2, 8 * epsilon(H.dtype)) * jnp.max(size)
+    opened = jnp.where(flat[None], vectors, 0)
+    return opened @ opened.T
 
 
 _implicit.defjvp(_implicit_jvp, symbolic_zeros=True)
