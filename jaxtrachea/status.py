@@ -40,7 +40,10 @@ class PressStatus(_Described):
         "solved, but the contact point is uncertain: flat contact (round the tool more), deep "
         "contact (press less) or an inaccurate wall of a mesh; see `contact_share`",
     )
-    BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
+    BAD_MATERIAL = (
+        10,
+        "a stiffness or the coefficient of friction is negative, or one is zero that divides",
+    )
     IN_LUMEN = (
         11,
         "the tool lies within the tube and did not come through the wall, or has not been clear of "
@@ -150,7 +153,7 @@ class RingStatus(_Described):
     BEHIND_GAP = 1, "the angle lies behind the ends of the ring, where there is no cartilage"
     NON_FINITE = 2, "an input or a result is not finite"
     OFF_TUBE = 3, "the contact lies beyond an end of the tube"
-    BAD_MATERIAL = 4, "a stiffness is negative"
+    BAD_MATERIAL = 4, "a stiffness is negative, or one is zero that divides"
 
 
 class ProfileEnd(_Described):

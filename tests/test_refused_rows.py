@@ -31,6 +31,12 @@ from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
+#: What these models divide by.
+NEVER_ZERO = {
+    "press": ("EI_L", "GA_L"),
+    "skeleton": ("EI_L", "EI_side", "k_M", "GA_L", "GA_side", "EI_C", "EA_L"),
+}
+
 pytestmark = pytest.mark.compiling
 
 OK, OFF, BAD = PressStatus.OK, PressStatus.OFF_TUBE, PressStatus.BAD_MATERIAL
@@ -80,23 +86,27 @@ READ = {
 def test_statuses_in_a_batch(which):
     """Off the tube and each negative stiffness in turn: NaN with a status of their own.
 
+    So are those of zero that the model divides by; others of zero are solved.
+
     Good rows keep every bit, and all derivatives are finite: those of refused rows are 0. Values
     that the model does not read, and k_3, may be negative.
     """
-    read = READ[which]
-    rows = [{}, *({n: -0.1} for n in read), {"k_3": -1e-4}, {}, {}, {}]
+    read, never = READ[which], NEVER_ZERO[which]
+    zero = [*never, *(n for n in read if n not in never)]
+    rows = [{}, *({n: -0.1} for n in read), *({n: 0.0} for n in zero), {"k_3": -1e-4}, {}, {}, {}]
     s = np.array([63.0] * (len(rows) - 3) + [-1e-9, 160.0001, 400.0])
-    refused = np.array([0, *[1] * len(read), 0, 1, 1, 1], bool)
-    wanted = ["OK", *["BAD_MATERIAL"] * len(read), "OK", *["OFF_TUBE"] * 3]
+    bad, good = len(read) + len(never), len(read) - len(never)
+    refused = np.array([0, *[1] * bad, *[0] * good, 0, 1, 1, 1], bool)
+    wanted = ["OK", *["BAD_MATERIAL"] * bad, *["OK"] * (good + 1), *["OFF_TUBE"] * 3]
     values = {n: np.array([row.get(n, v) for row in rows]) for n, v in ALL.items()}
     (_, (status, force, more)), slopes = compiled(which)(values, s)
     names = RingStatus if which == "skeleton" else PressStatus
     last = np.asarray(status).reshape(len(rows), -1)[:, -1]
     assert [names(int(k)).name for k in last] == wanted
     for out in (force, more):
-        bad = ~np.isfinite(np.asarray(out)).reshape(len(rows), -1)
-        np.testing.assert_array_equal(bad.all(axis=1), refused)
-        np.testing.assert_array_equal(bad.any(axis=1), refused)
+        lost = ~np.isfinite(np.asarray(out)).reshape(len(rows), -1)
+        np.testing.assert_array_equal(lost.all(axis=1), refused)
+        np.testing.assert_array_equal(lost.any(axis=1), refused)
     for slope in jax.tree.leaves(slopes):
         assert np.all(np.isfinite(slope))
         assert np.all(slope[refused] == 0)

@@ -21,6 +21,7 @@ from jaxtrachea.mechanics.friction import Coulomb, Slide
 from jaxtrachea.mechanics.press import Options, check_line, indentation, local_law, read_values
 from jaxtrachea.mechanics.skeleton import Rings, Skeleton, local_frame
 from jaxtrachea.mechanics.validation import (
+    IN_TWO_PLANES,
     Validated,
     check_place,
     float_type,
@@ -337,7 +338,7 @@ def place_at(
     s_c, phi_c, onset = _checked(geometry, material, s_c, phi_c, options, onset)
     rings, levels = options.rings, {"axial": options.axial, "shear": options.press.shear}
     used = (*read_values(options.press), *skeleton.read_values(rings, **levels))
-    asked = validate(geometry, material, s_c, dict.fromkeys(used))
+    asked = validate(geometry, material, s_c, dict.fromkeys(used), divided=IN_TWO_PLANES)
     unit = skeleton.respond(geometry, asked.material, asked.s_c, phi_c, rings=rings, **levels)
     law = local_law(geometry, asked.material, asked.s_c, options.press)
     return Place(asked=asked, unit=unit, law=law, phi_c=phi_c, onset=onset)

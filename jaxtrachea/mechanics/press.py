@@ -262,8 +262,8 @@ def press(
         Rows where the wall moves further than the tube's radius are TOO_DEEP: solved, but beyond
         what ring and ligament are linear for (15 % at a quarter of it, docs/validity.md).
         A contact off the tube (OFF_TUBE), a negative stiffness (BAD_MATERIAL) and one or a place
-        that is no number (NON_FINITE) are NaN throughout; a stiffness of zero is the limit of a
-        small one where that exists.
+        that is no number (NON_FINITE) are NaN throughout; k_M, k_1 and k_3 of zero are the limits
+        of small ones, a ligament of zero is BAD_MATERIAL.
 
     Raises:
         ValueError: an argument that is no number, an array of a length that does not fit the tube,

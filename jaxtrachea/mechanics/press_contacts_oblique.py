@@ -21,7 +21,13 @@ from jaxtrachea.mechanics.press_contacts import (
 )
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.mechanics.validation import check_shapes, mask, status_of, validate
+from jaxtrachea.mechanics.validation import (
+    IN_TWO_PLANES,
+    check_shapes,
+    mask,
+    status_of,
+    validate,
+)
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -173,8 +179,9 @@ def places_of(geometry: Geometry, material: Material, s_c, phi_c, present, used:
         used: values of the material that are read.
     """
     s_c = jnp.where(present, s_c, geometry.length / 2)
-    s_c, refused = jax.vmap(lambda s: validate(geometry, material, s, used)[1:])(s_c)
-    material = validate(geometry, material, s_c[0], used).material
+    admitted = functools.partial(validate, geometry, material, used=used, divided=IN_TWO_PLANES)
+    s_c, refused = jax.vmap(lambda s: admitted(s)[1:])(s_c)
+    material = admitted(s_c[0]).material
     on, at = on_ring(geometry.half_angle, phi_c)
     why = jnp.where(jnp.isnan(phi_c), PressStatus.NON_FINITE, PressStatus.BEHIND_GAP)
     on = on | ~present | (refused != PressStatus.OK)

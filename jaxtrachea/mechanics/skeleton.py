@@ -18,7 +18,14 @@ from jaxtrachea.mechanics import axial as _axial
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics import spatial_beam
 from jaxtrachea.mechanics._matrix2 import mul
-from jaxtrachea.mechanics.validation import check_place, float_type, mask, status_of, validate
+from jaxtrachea.mechanics.validation import (
+    IN_TWO_PLANES,
+    check_place,
+    float_type,
+    mask,
+    status_of,
+    validate,
+)
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -106,7 +113,8 @@ def _response(
     shear: bool,
 ) -> Skeleton:
     """`skeleton_response`, of arguments that are checked."""
-    asked = validate(geometry, material, s_c, read_values(rings, axial=axial, shear=shear))
+    used = read_values(rings, axial=axial, shear=shear)
+    asked = validate(geometry, material, s_c, used, divided=IN_TWO_PLANES)
     levels = {"rings": rings, "axial": axial, "shear": shear}
     unit = respond(geometry, asked.material, asked.s_c, phi_c, **levels)
     off_tube = asked.refused == PressStatus.OFF_TUBE

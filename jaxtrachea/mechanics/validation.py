@@ -1,4 +1,4 @@
-"""What a press may be asked: shapes that fit the tube, a place on it, stiffnesses not negative.
+"""What a press may be asked: shapes that fit the tube, a place on it, stiffnesses it can be of.
 
 Shapes are static and end in a `ValueError`; places and stiffnesses may be traced and end in a
 status. Refused values are replaced *before* they are used and the results hidden after, so that
@@ -21,12 +21,15 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import VALUES, Material, meaningless
 
+#: What skeletons of two planes divide by on top of `Declaration.divides`.
+IN_TWO_PLANES = ("k_M",)
+
 
 class Validated(NamedTuple):
     """What a press is computed with.
 
     Attributes:
-        material: with 1 in place of values that are negative or not finite.
+        material: with 1 in place of values that it cannot have, or that are not finite.
         s_c: contact position, mm; the middle of the tube in place of one where it is refused.
         refused: `PressStatus`: OK, OFF_TUBE, NON_FINITE or BAD_MATERIAL.
     """
@@ -43,6 +46,7 @@ def validate(
     used: Iterable[str],
     *,
     reach: float = 0.0,
+    divided: Iterable[str] = (),
 ) -> Validated:
     """Check what a press is asked.
 
@@ -52,6 +56,7 @@ def validate(
         used: names of the values of the material that the model reads and that must not be
             negative; None values are passed over.
         reach: how far the tool extends along s from s_c, mm: none of it may lie off the tube.
+        divided: see `without_negative`.
 
     Raises:
         ValueError: a value of the material that is neither a scalar nor one for each span or ring,
@@ -59,7 +64,7 @@ def validate(
     """
     s_c, length, used = check_place(geometry, material, s_c), geometry.length, tuple(used)
     on = (s_c >= reach) & (s_c <= length - reach)
-    material, bad = without_negative(material, used)
+    material, bad = without_negative(material, used, divided)
     material, lost = _replaced(material, used, lambda value: ~jnp.isfinite(value))
     refused = jnp.where(on, PressStatus.OK, PressStatus.OFF_TUBE)
     refused = jnp.where(~lost & ~jnp.isnan(s_c), refused, PressStatus.NON_FINITE)
@@ -142,9 +147,18 @@ def check_alike(material: Material, like: Any, cure: str) -> None:
                              joint=" ", cure=f"give the same values, or {cure}")  # fmt: skip
 
 
-def without_negative(material: Material, used: Iterable[str]) -> tuple[Material, Array]:
-    """The material with 1 in place of negative values, and whether there were any."""
-    return _replaced(material, used, lambda value: value < 0)
+def without_negative(
+    material: Material, used: Iterable[str], divided: Iterable[str] = ()
+) -> tuple[Material, Array]:
+    """The material with 1 in place of negative values, and whether there were any.
+
+    And of zeros where a model divides: `Declaration.divides`, and `divided`, of this one alone.
+    """
+    used = tuple(used)
+    never = {name for name in used if VALUES[name].divides} | set(divided)
+    material, bad = _replaced(material, never, lambda value: value <= 0)
+    material, negative = _replaced(material, set(used) - never, lambda value: value < 0)
+    return material, bad | negative
 
 
 def _replaced(

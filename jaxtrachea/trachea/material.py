@@ -77,6 +77,8 @@ class Declaration:
         requires: value without which it means nothing.
         varies_by: where an array may give each its own value.
         signed: whether it may be zero or negative.
+        divides: whether every model that reads it divides by it: zero is then no limit of small
+            values.
         fit: None where a fit cannot identify it.
     """
 
@@ -91,6 +93,7 @@ class Declaration:
     requires: str = ""
     varies_by: VariesBy = ""
     signed: bool = False
+    divides: bool = False
     fit: Fitted | None = None
 
     def __post_init__(self):
@@ -128,12 +131,13 @@ class Material(eqx.Module):
 
     EI_L: Float[Array, "..."] = _field(
         "EI_L", "N mm^2", "bending_stiffness", "ligament bending stiffness",
-        symbol="E_L I_L", part="skeleton", varies_by="span", fit=Fitted(10.0, 1e-4, 1e7),
+        symbol="E_L I_L", part="skeleton", varies_by="span", divides=True,
+        fit=Fitted(10.0, 1e-4, 1e7),
     )  # fmt: skip
     GA_L: Float[Array, "..."] | None = _field(
         "GA_L", "N", "force", "ligament shear stiffness",
         symbol="kappa G A", part="skeleton", needs="shear", absent="no shear", varies_by="span",
-        fit=Fitted(10.0, 1e-4, 1e6),
+        divides=True, fit=Fitted(10.0, 1e-4, 1e6),
     )  # fmt: skip
     k_M: Float[Array, "..."] = _field(
         "k_M", "N/mm", "stiffness", "muscle stiffness under a ring",
@@ -181,6 +185,7 @@ class Material(eqx.Module):
     EA_L: Float[Array, "..."] | None = _field(
         "EA_L", "N", "force", "ligament axial stiffness",
         symbol="E_L A_L", part="skeleton", needs="axial", absent="no stretch", varies_by="span",
+        divides=True,
     )  # fmt: skip
     k_A: Float[Array, ""] | None = _field(
         "k_A", "N/mm", "stiffness", "axial spring of the carina end",
@@ -193,7 +198,7 @@ class Material(eqx.Module):
     EI_C: Float[Array, ""] | None = _field(
         "EI_C", "N mm^2", "bending_stiffness", "cartilage bending stiffness in a ring's plane",
         symbol="E_C I_C", part="skeleton", needs="arch, sections", absent="rings do not bend",
-        fit=Fitted(25.0, 1e-3, 1e6),
+        divides=True, fit=Fitted(25.0, 1e-3, 1e6),
     )  # fmt: skip
     k_t: Float[Array, ""] | None = _field(
         "k_t", "N/mm", "stiffness", "muscular bar between the ends of a ring",
@@ -202,10 +207,12 @@ class Material(eqx.Module):
     EI_side: Float[Array, "..."] | None = _field(
         "EI_side", "N mm^2", "bending_stiffness", "EI_L for bending along the circumference",
         part="skeleton", needs="second plane", absent="EI_L", varies_by="span",
+        divides=True,
     )  # fmt: skip
     GA_side: Float[Array, "..."] | None = _field(
         "GA_side", "N", "force", "GA_L for shear along the circumference",
         part="skeleton", needs="second plane", absent="GA_L", requires="GA_L", varies_by="span",
+        divides=True,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.level import Level, Motion, Record, Response, Size
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.press_in_time import press_in_time
-from jaxtrachea.mechanics.validation import check_shapes, without_negative
+from jaxtrachea.mechanics.validation import IN_TWO_PLANES, check_shapes, without_negative
 from jaxtrachea.relaxation.filter import Relaxation
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import DEEP, OF_PRESS, VALUES, Material, material_of
@@ -142,8 +142,9 @@ class Line(Level):
         self, material: Material, also: Iterable[str]
     ) -> tuple[Material, Bool[Array, ""]]:
         """1 in the place of negative values; others that the options do not read stay."""
-        read = _press.read_values(self.options)
-        return without_negative(material, dict.fromkeys((*read, *also)))
+        read, also = _press.read_values(self.options), tuple(also)
+        divided = [name for name in IN_TWO_PLANES if name in also]
+        return without_negative(material, dict.fromkeys((*read, *also)), divided)
 
     def relaxed(
         self, tube: Geometry, material: Material, motion: Motion, relaxation: Relaxation
