@@ -11,9 +11,11 @@ and A the normal matrix of the others,
 Unknowns that the position alone reads (its onset, its offset) are fitted to it. The error is a
 smooth bias of a whole curve, not noise: it is compared with the force as e = F (a + b x + c x^2),
 x the depth over the deepest, and what scatters about that is noise and does not count. What noise
-in the parameters explains is taken off, since bands have it apart. The square of the share at a
-depth is half that of all depths, half that of this one, the mean of n positions; it counts with
-n - 1 degrees of freedom.
+of the curve and in the parameters explains, v, is not the model's, and bands have it apart: the
+share tau of a depth is that of n positions whose errors have the variance tau^2 + v, by maximum
+likelihood. Positions that the others hardly determine, of large v, so count little. Its square is
+half that of all depths, half that of this one; it counts with one degree of freedom less than the
+positions that tell it, (sum w)^2 / sum w^2 with their weights w = (tau^2 + v)^-2.
 """
 
 from typing import NamedTuple
@@ -45,6 +47,8 @@ SHAPES = 3
 _SINGULAR = 1e-10
 #: Slope along such a direction, over the largest of the position, from which it counts.
 _ACTS = 1e-4
+#: Iterations of the likelihood.
+_ITERATIONS = 200
 
 
 class ModelError(NamedTuple):
@@ -55,7 +59,8 @@ class ModelError(NamedTuple):
         share: standard deviation of the model's error between positions at these depths, share of
             the force; NaN where too few positions tell it; (points,).
         positions: that could be left out.
-        quantile: of a 95 % interval with `positions` - 1 degrees of freedom; NaN likewise.
+        quantile: of a 95 % interval with a degree of freedom less than the positions that tell it;
+            NaN likewise.
         growth: by which standard errors from the parameters grow, since neighbouring residuals are
             alike; inf where the samples are worth no more than the unknowns. Then `share` is all
             that is known of the band, with what the parameters err.
@@ -222,31 +227,47 @@ def _of_lane(stored: FitResult, lane: int, curves: tuple[Curve, ...], left: _Lef
     at = np.array([c.s_c for c in curves if c.s_c is not None], float)
     deepest = max(float(np.max(fitted.above_touch(c)[0], initial=0)) for c in curves)
     grid = np.linspace(0, deepest, POINTS)
-    squares = []
+    found_at = []
     for out in places.values():
         out = sorted(set(out))
         found = left.predicted(out) if len(out) < len(curves) else None
         if found is not None:
-            squares.append(_squares(fitted, [curves[t] for t in out], *found, grid))
+            found_at.append(_squares(fitted, [curves[t] for t in out], *found, grid))
     from scipy.special import stdtrit
 
-    squares = [v for v in squares if np.isfinite(v).all()]
-    n, growth = len(squares), float(stored.effective.growth[lane]) if stored.study.free else 1.0
+    found_at = [v for v in found_at if np.isfinite(v).all()]
+    n, growth = len(found_at), float(stored.effective.growth[lane]) if stored.study.free else 1.0
     if n < MIN_POSITIONS or deepest <= 0:
         return ModelError(grid, np.full(POINTS, np.nan), n, np.nan, growth, at)
-    by_depth = np.mean(squares, axis=0)
+    square, explained = np.swapaxes(found_at, 0, 1)
+    by_depth, telling = _share(square, explained)
     sampled = np.concatenate([fitted.above_touch(c)[0] for c in curves])
-    pooled = np.mean(np.interp(sampled[sampled > 0], grid, by_depth))
+    sampled = sampled[sampled > 0]
+    pooled, telling = (np.mean(np.interp(sampled, grid, v)) for v in (by_depth, telling))
     # Few positions tell the square at one depth badly, all depths together none of its growth.
-    share = np.sqrt(np.maximum((pooled + np.maximum(by_depth, 0)) / 2, 0))
-    return ModelError(grid, share, n, float(stdtrit(n - 1, 0.975)), growth, at)
+    share = np.sqrt(np.maximum((pooled + by_depth) / 2, 0))
+    return ModelError(grid, share, n, float(stdtrit(max(telling - 1, 1), 0.975)), growth, at)
 
 
-def _squares(fitted: Pressed, curves, error, variance, grid) -> Float[np.ndarray, " points"]:
+def _share(square, explained) -> Float[np.ndarray, "2 points"]:
+    """Variance tau^2 of what `square` is beyond what is explained; and positions that tell it.
+
+    Of n errors of mean 0 and variance tau^2 + v each, (n, points), by maximum likelihood; where
+    they are less than what is explained, it is negative, so that depths together tell no more.
+    """
+    v = np.maximum(explained, 1e-12 * np.max(square + explained))
+    variance = np.mean(square, axis=0)
+    for _ in range(_ITERATIONS):
+        w = (np.maximum(variance, 0) + v) ** -2
+        variance = np.sum(w * (square - v), axis=0) / np.sum(w, axis=0)
+    return np.stack([variance, np.sum(w, axis=0) ** 2 / np.sum(w**2, axis=0)])
+
+
+def _squares(fitted: Pressed, curves, error, variance, grid) -> Float[np.ndarray, "2 points"]:
     """Square of the smooth error of one position over the force, at the depths `grid`.
 
-    Less what the noise of the curve and in the parameters explains, so that it may be negative.
-    The mean over curves of the position; NaN where none has a force.
+    And the variance that noise of the curve and in the parameters explains. Means over curves of
+    the position; NaN where none has a force.
     """
     out = []
     for curve, e, v in zip(curves, error, variance, strict=True):
@@ -266,5 +287,5 @@ def _squares(fitted: Pressed, curves, error, variance, grid) -> Float[np.ndarray
         noise = left * np.sum((at @ inverse) ** 2, axis=1)
         order = np.argsort(depth)
         known = np.interp(grid, depth[order], (v / F**2)[order])
-        out.append((at @ (inverse @ e)) ** 2 - noise - known)
-    return np.mean(out, axis=0) if out else np.full(len(grid), np.nan)
+        out.append(np.stack([(at @ (inverse @ e)) ** 2, noise + known]))
+    return np.mean(out, axis=0) if out else np.full((2, len(grid)), np.nan)

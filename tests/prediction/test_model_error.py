@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 import jaxtrachea
 from jaxtrachea.cli.specification import settings_of, study_of
@@ -68,6 +69,25 @@ def test_noise_is_no_error_of_the_model(read):
     assert {e.positions for e in found.values()} == {4}
 
 
+def test_a_position_that_the_others_hardly_determine_counts_little():
+    """Maximum of the likelihood by SciPy. The plain mean said 0.04, and in the second case 0."""
+    for square, explained in (
+        ([3e-4, 1e-4, 5e-4, 2e-4, 4e-4, 0.25], [1e-6] * 5 + [0.04]),
+        ([1e-2, 2e-2, 5e-3, 1e-2, 3e-2, 1e-5], [1e-6] * 5 + [0.06]),
+    ):
+        y, v = np.array(square), np.array(explained)
+
+        def twice(log, y=y, v=v):
+            return np.sum(y / (np.exp(log) + v) + np.log(np.exp(log) + v))
+
+        best = minimize_scalar(twice, bounds=(-20, 0), method="bounded", options={"xatol": 1e-9})
+        found, telling = model_error._share(y[:, None], v[:, None])
+        np.testing.assert_allclose(found, np.exp(best.x), rtol=1e-6)
+        assert abs(telling[0] - 5) < 0.1
+    less, _ = model_error._share(np.array([[0.5], [0.1]]), np.ones((2, 1)))
+    np.testing.assert_allclose(less, -0.7)  # the mean, where all are known alike
+
+
 def test_a_band_says_what_it_knows(read, monkeypatch):
     D = np.array([0.0, 2.0, 4.0])
     here, between = (
@@ -128,7 +148,7 @@ def test_bands_hold_positions_left_out():
     """Independent finite elements: 90 to 99 % of the samples with force; forces to 1.2 %."""
     found = left_out("fit.toml", 3, 16)
     inside = np.concatenate([c.covered[c.with_force] for c in found])
-    assert 0.9 <= np.mean(inside) <= 0.99
+    assert 0.9 <= np.mean(inside) <= 0.99, np.mean(inside)
     peaks = [c.residual[c.with_force] / np.max(c.curve.force) for c in found]
     assert np.sqrt(np.mean(np.concatenate(peaks) ** 2)) <= 0.012
     first = [c.residual[1] / c.curve.force[1] for c in found]
