@@ -374,6 +374,15 @@ BAD = {
         GOOD + PRESS + '[trachea]\nwall = "26 mm"',
         ["wall is 26 mm, thicker than the radius"],
     ),
+    "centreline beside the mesh": (
+        GOOD + PRESS + "[trachea]\nfile = 'tube.stl'\nlarynx = [1, 0, 0]\n"
+        "centreline = [[500, 0, 0], [600, 0, 0]]",
+        ["trachea.file: tube.stl: the centreline, lengthened", "points inside", "centreline="],
+    ),
+    "direction of nothing": (
+        GOOD + PRESS + "[trachea]\nfile = 'tube.stl'\nlarynx = [0, 0, 0]",
+        ["trachea.file: tube.stl: larynx= is [0.0, 0.0, 0.0]", "three finite numbers"],
+    ),
     "tool of a metre's radius": (
         GOOD + LINE + '[tool]\nshape = "sphere"\nradius = "1 m"',
         ["tool is 2000 mm across", "is the unit wrong"],
