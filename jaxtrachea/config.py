@@ -196,7 +196,10 @@ Rings = Annotated[
 
 
 class TracheaSection(Section):
-    """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given."""
+    """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given.
+
+    Lengths that no trachea has are refused: `trachea.sizes`.
+    """
 
     preset: Literal["table-1"] | None = None
     """the same as leaving length and rings out"""
@@ -237,7 +240,9 @@ class ModelSection(Section):
     contact: Literal["unilateral", "bonded"] = "unilateral"
     """`bonded`: press or draw, odd law"""
     onset_width: PositiveLength = 1e-3
-    """width of the smooth first touch; where an onset is fitted, each curve has its own"""
+    """width of the smooth first touch, at most a tenth of the radius; where an onset is fitted, each
+    curve has its own
+    """
     transition: PositiveLength | None = None
     """from a ring's centre to where the ligament's local law holds; none: half the closest spacing
     (of one ring: to the nearer end)

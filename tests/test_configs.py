@@ -370,6 +370,14 @@ BAD = {
         GOOD + LINE + BALL + '[trachea]\nlength = "1.2 m"\nrings = ["0.4 m", "0.8 m"]',
         ["trachea.length is 1200 mm", "expected 2 to 1000 mm", "is the unit wrong"],
     ),
+    "rings of 4 m": (
+        GOOD + PRESS + '[trachea]\nring_height = "4 m"',
+        ["trachea.ring_height is 4000 mm", "expected 0.02 to 100 mm", "is the unit wrong"],
+    ),
+    "first touch of a metre": (
+        GOOD + PRESS + '[model]\nonset_width = "1 m"',
+        ["model.onset_width is 1000 mm", "expected 0 to 1.13 mm", "is the unit wrong"],
+    ),
     "wall thicker than the radius": (
         GOOD + PRESS + '[trachea]\nwall = "26 mm"',
         ["wall is 26 mm, thicker than the radius"],
