@@ -118,6 +118,7 @@ TYPES = {
     "ShareNoise": ("share, or word", ""),
     "LengthNoise": ("length, or word", ""),
     "Number": ("the parameter's", ""),
+    "CountOrAuto": ("`auto`, or whole number", ""),
     "NumberOrTrue": ("the parameter's, or `true`", ""),
     "Rings": ("positions, or table", ""),
     "Direction": ("direction", ""),

@@ -23,6 +23,9 @@ from jaxtrachea.files.toml import SpecError as SpecError
 from jaxtrachea.relaxation.words import Word
 from jaxtrachea.units import UnitError, parse_quantity
 
+#: Most fits that are computed or saved together.
+MOST_LANES = 1_000_000
+
 
 def quantity(dimension: str, *, positive: bool = False, words: tuple[str, ...] = ()):
     """A field read as a quantity with its unit ("9 mm"), kept as a float in internal units.
@@ -49,6 +52,14 @@ def quantity(dimension: str, *, positive: bool = False, words: tuple[str, ...] =
         return number
 
     return BeforeValidator(read)
+
+
+def _count_or_auto(value: Any) -> Any:
+    """One message for both kinds."""
+    number = isinstance(value, int) and not isinstance(value, bool)
+    if value != "auto" and not (number and 1 <= value <= MOST_LANES):
+        raise ValueError(f"expected 'auto', or a whole number from 1 to {MOST_LANES}")
+    return value
 
 
 def _number_or_quantity(value: Any) -> Any:
@@ -99,6 +110,7 @@ ShareNoise = Annotated[
     quantity("dimensionless", words=("estimate", "auto")),
 ]
 LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, words=("estimate",))]
+CountOrAuto = Annotated[Literal["auto"] | int, BeforeValidator(_count_or_auto)]
 Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
 NumberOrTrue = Annotated[Any, BeforeValidator(_value_or_true)]
 #: One text stands for a list of it.
@@ -196,7 +208,10 @@ Rings = Annotated[
 
 
 class TracheaSection(Section):
-    """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given."""
+    """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given.
+
+    Lengths that no trachea has are refused: `trachea.sizes`.
+    """
 
     preset: Literal["table-1"] | None = None
     """the same as leaving length and rings out"""
@@ -237,7 +252,9 @@ class ModelSection(Section):
     contact: Literal["unilateral", "bonded"] = "unilateral"
     """`bonded`: press or draw, odd law"""
     onset_width: PositiveLength = 1e-3
-    """width of the smooth first touch; where an onset is fitted, each curve has its own"""
+    """width of the smooth first touch, at most a tenth of the radius; where an onset is fitted,
+    each curve has its own
+    """
     transition: PositiveLength | None = None
     """from a ring's centre to where the ligament's local law holds; none: half the closest spacing
     (of one ring: to the nearer end)
@@ -380,11 +397,11 @@ class FitSection(Section):
     """per start, on the few samples and on all"""
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
     """relative, of cost, step and gradient"""
-    batch: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
+    batch: CountOrAuto = "auto"
     """fits computed together, at most. `auto`: 128, on a GPU 1,024, or what memory allows; on a CPU
     fewer of long curves; one with `skeleton = "sections"` on a CPU
     """
-    save_every: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
+    save_every: CountOrAuto = "auto"
     """fits saved together"""
     precision: Literal["float64", "float32"] = "float64"
     """of all numbers of the fit"""

@@ -370,9 +370,26 @@ BAD = {
         GOOD + LINE + BALL + '[trachea]\nlength = "1.2 m"\nrings = ["0.4 m", "0.8 m"]',
         ["trachea.length is 1200 mm", "expected 2 to 1000 mm", "is the unit wrong"],
     ),
+    "rings of 4 m": (
+        GOOD + PRESS + '[trachea]\nring_height = "4 m"',
+        ["trachea.ring_height is 4000 mm", "expected 0.02 to 100 mm", "is the unit wrong"],
+    ),
+    "first touch of a metre": (
+        GOOD + PRESS + '[model]\nonset_width = "1 m"',
+        ["model.onset_width is 1000 mm", "expected 0 to 1.13 mm", "is the unit wrong"],
+    ),
     "wall thicker than the radius": (
         GOOD + PRESS + '[trachea]\nwall = "26 mm"',
         ["wall is 26 mm, thicker than the radius"],
+    ),
+    "centreline beside the mesh": (
+        GOOD + PRESS + "[trachea]\nfile = 'tube.stl'\nlarynx = [1, 0, 0]\n"
+        "centreline = [[500, 0, 0], [600, 0, 0]]",
+        ["trachea.file: tube.stl: the centreline, lengthened", "points inside", "centreline="],
+    ),
+    "direction of nothing": (
+        GOOD + PRESS + "[trachea]\nfile = 'tube.stl'\nlarynx = [0, 0, 0]",
+        ["trachea.file: tube.stl: larynx= is [0.0, 0.0, 0.0]", "three finite numbers"],
     ),
     "tool of a metre's radius": (
         GOOD + LINE + '[tool]\nshape = "sphere"\nradius = "1 m"',

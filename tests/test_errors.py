@@ -12,9 +12,10 @@ from jaxtrachea.measurements.curve import DataError
 from jaxtrachea.scene.declare import PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.sizes import SizeError, check_sizes
+from jaxtrachea.scene.sizes import check_sizes
 from jaxtrachea.trachea.mesh import MeshError
 from jaxtrachea.trachea.section import geometry_of
+from jaxtrachea.trachea.sizes import SizeError
 
 
 @pytest.mark.parametrize(

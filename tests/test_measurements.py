@@ -1,6 +1,7 @@
 """Tables of measurements, the checks that every curve passes, and what a study is read from."""
 
 import hashlib
+import math
 import os
 import re
 import subprocess
@@ -236,6 +237,16 @@ def test_bad_curve(tmp_path, rows, options, kind, message):
     assert bad.kind == kind
     assert bad.specimen == "study"
     assert re.search(message, bad.message), bad.message
+
+
+@pytest.mark.parametrize("loading", ["last", "first", "record", "all", "require-monotone"])
+def test_a_record_that_is_all_hold_covers_nothing(tmp_path, loading):
+    """Its times uneven, as a logarithmic clock's: it was "an unloading branch", from 4 to 4 mm."""
+    rows = [(0.02 * 1.1**i, 4, 2 + math.exp(-i / 10)) for i in range(60)]
+    text = table(rows, "time [s],displacement [mm],force [N]")
+    bad = only_bad(read(put(tmp_path, text), loading=loading))
+    assert bad.kind == "absurd_scale"
+    assert "displacement covers 0 mm" in bad.message
 
 
 def test_non_finite_lists_the_first_rows(tmp_path):

@@ -367,6 +367,11 @@ def _gutter(path):
     )
 
 
+#: Lines along the axis of the tube, beyond its end; and along the tube, 5 mm outside its wall.
+OFF_END = np.array([[150.0, 0, 0], [250, 0, 0]]) @ ROTATION.T + SHIFT
+BESIDE = np.array([[0.0, 0, 18], [92, 0, 18]]) @ ROTATION.T + SHIFT
+
+
 def known(**landmarks):
     return {"landmarks": Landmarks(**landmarks)}
 
@@ -386,6 +391,12 @@ def known(**landmarks):
         (write, known(larynx=ROTATION @ Y), r"larynx= points across"),
         (write, known(larynx=ROTATION @ X, anterior=ROTATION @ X), r"anterior= points along"),
         (write, known(larynx=ROTATION @ X, ring_positions=[3.0, 400.0]), r"inside \(0, "),
+        (write, known(larynx=(math.nan, 0.0, 0.0)), r"larynx= is \[nan, .* finite numbers, not"),
+        (write, known(larynx=(1.0, 0.0)), r"larynx= is \[1.0, 0.0\], no direction"),
+        (write, known(larynx=np.array(["up"])), r"larynx= is .*up.*; expected numbers"),
+        (write, known(anterior=(math.inf, 0.0, 0.0)), r"anterior= is \[inf, .* finite numbers"),
+        (write, known(centreline=OFF_END), r"centreline, lengthened .* before the mesh .*centrel"),
+        (write, known(centreline=BESIDE), r"centreline runs outside the mesh over 100 % .*centrel"),
         (write, {"part": "lung"}, r"no object 'lung' in it; expected one of"),
         (write, {"rings": "absent.stl"}, r"rings='absent.stl': there is no such file"),
         (write, known(centreline=np.zeros((3, 2))), r"centreline has shape \(3, 2\)"),

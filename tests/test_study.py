@@ -23,8 +23,9 @@ from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction.predict import check_position
-from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.section import geometry_of
+from jaxtrachea.trachea.sizes import SizeError
 
 SPEC = """
 [data]
@@ -267,6 +268,61 @@ def test_what_is_named_is_fitted_unless_fixed(change, fixed):
     assert table["onset"].fixed is fixed
     assert table["force_offset"].fixed
     assert not table["k_1"].fixed
+
+
+#: Usual sizes of tracheas: length, radius and height of a ring, mm.
+TRACHEAS = {
+    "mouse": (8.0, 0.6, 0.2),
+    "rat": (30.0, 1.7, 0.6),
+    "newborn": (40.0, 2.5, 1.5),
+    "adult": (110.0, 9.0, 4.0),
+    "cow": (650.0, 25.0, 10.0),
+    "horse": (800.0, 30.0, 13.0),
+}
+
+
+@pytest.mark.parametrize("animal", TRACHEAS)
+def test_tracheas_of_all_animals_are_taken_and_no_other_unit(animal):
+    """A fit took 1,000 times their size without a word."""
+    found = dict(zip(("length", "radius", "ring_height"), TRACHEAS[animal], strict=True))
+    length = found["length"]
+    rings = {"count": 8, "first": f"{0.1 * length} mm", "last": f"{0.9 * length} mm"}
+    given = {name: f"{value} mm" for name, value in found.items()} | {"rings": rings}
+    geometry = geometry_of(TracheaSection.model_validate(given))
+    assert [float(getattr(geometry, name)) for name in found] == list(found.values())
+    for name, value in found.items():
+        for unit in ("m", "um"):
+            other = given | {name: f"{value} {unit}"}
+            if name == "length":
+                other["rings"] = {"count": 8, "first": f"{0.1 * value} {unit}",
+                                  "last": f"{0.9 * value} {unit}"}  # fmt: skip
+            with pytest.raises(SpecError, match=f"^trachea.{name} is .* is the unit wrong"):
+                geometry_of(TracheaSection.model_validate(other))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"onset_width": 1.2}, r"onset_width is 1.2 mm; expected 0 to 1.13 mm; .* unit wrong"),
+        ({"onset_width": 1000.0}, r"onset_width is 1000 mm; expected 0 to 1.13 mm"),
+        ({"transition": 5000.0}, r"transition is 5000 mm; expected 0.02 to 160 mm"),
+        ({"transition": 0.005}, r"transition is 0.005 mm; .* It would be 5 mm"),
+    ],
+)
+def test_lengths_of_the_model_in_another_unit_are_refused(options, says):
+    """From Python, and in a specification with the key; the error says what it may be instead."""
+    with pytest.raises(SizeError, match=f"^{says}"):
+        build_study([signed(np.copy, np.copy)], table_1(), Options(**options))
+    model = {name: f"{value} mm" for name, value in options.items()}
+    spec = FitSpec.model_validate({"data": {"files": "x"}, "model": model})
+    with pytest.raises(SpecError, match=f"^model.{says}"):
+        study_of(spec, Measurements((signed(np.copy, np.copy),), (), ()))
+
+
+def test_a_tube_in_metres_is_refused_in_python():
+    tube = Geometry.create(0.16, [0.05, 0.1], radius=0.0113, ring_height=0.004)
+    with pytest.raises(SizeError, match=r"^geometry.length is 0.16 mm; .* It would be 160 mm"):
+        build_study([signed(np.copy, np.copy)], tube, Options())
 
 
 @pytest.mark.parametrize("count", [1, 2, 16])

@@ -24,6 +24,7 @@ from jaxtrachea.mechanics.sections.material import LEAST, SECTION_VALUES, Wall
 from jaxtrachea.optimisation.batching import MOST_SLOTS
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
+from jaxtrachea.trachea.sizes import SizeError
 from jaxtrachea.units import UnitError, parse_quantity
 
 #: Parameters of the levels `arch` and `arch2` of scenes, and what a fit takes instead.
@@ -275,6 +276,8 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
         )
     except SpecError:
         raise
+    except SizeError as error:
+        raise SpecError.like(error, key=f"model.{error.key}") from None
     except ValueError as error:
         raise SpecError(str(error)) from None
 

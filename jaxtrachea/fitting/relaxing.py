@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.whole_record import ramp_speed
 from jaxtrachea.mechanics.equilibrium import Equilibrium
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.mechanics.press import Contact
@@ -34,6 +35,8 @@ from jaxtrachea.trachea.material import OF_TIME
 SHORTER, LONGER = 1 / 3, 3.0
 #: Laws whose branches depend on the span of the records.
 _OF_SPAN = ("power",)
+#: Ratio of speeds up to which they are the same.
+SAME_SPEED = 1.1
 
 
 def span_of(curves: Sequence[Curve]) -> Span:
@@ -45,6 +48,25 @@ def span_of(curves: Sequence[Curve]) -> Span:
         steps.append(float(np.min(step[step > 0], initial=math.inf)))
         longest = max(longest, float(curve.time[-1] - curve.time[0]))
     return Span(min(steps), longest)
+
+
+def beyond_ramps(curves: Sequence[Curve], speed: float, way: float) -> str:
+    """Whether a ramp is faster than all of the records, in words; "" if not.
+
+    It is if it takes less time by more than the step of their samples, and by a tenth.
+
+    Args:
+        curves: at least one; each has its time.
+        speed: of the ramp, mm/s.
+        way: of the ramp, mm.
+    """
+    times = ((c.time, c.displacement) for c in curves if c.time is not None)
+    fastest = max(ramp_speed(*record) for record in times)
+    if fastest == 0 or speed <= SAME_SPEED * fastest:
+        return ""
+    if way / fastest - way / speed <= span_of(curves).shortest:
+        return ""
+    return f"extrapolated from ramps of at most {fastest:.3g} mm/s"
 
 
 def with_span(options: Options, span: Span) -> Options:

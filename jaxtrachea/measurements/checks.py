@@ -42,8 +42,8 @@ def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
     """Turn what a reader found into a usable curve, or into the reason why it is none.
 
     Order: shapes, finite numbers, position, direction, signs, plausible size, compliance of the
-    machine, segments, faults of the record, displacement window, number of points, monotone
-    displacement (where required), signal.
+    machine, number of points and their range, segments, faults of the record, displacement window,
+    number of points left and their range, monotone displacement (where required), signal.
 
     Args:
         raw: the curve as read, in mm, N, rad.
@@ -79,6 +79,7 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     force = options.force_sign * raw.force
     _check_scale(raw, displacement, force, options)
     displacement = without_machine(displacement, force, options.compliance_mm_N)
+    _check_amount(np.ones(displacement.shape, bool), displacement, options)
     found = segments_of(raw, displacement, force, options)
     faulty = faults_of(displacement, force, found, options)
     whole = found if options.loading == "record" else None

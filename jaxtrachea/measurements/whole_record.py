@@ -137,6 +137,25 @@ def speed_of(time: np.ndarray, displacement: np.ndarray) -> float:
     return float((way[within[-1]] - way[within[0]]) / (time[within[-1]] - time[within[0]]))
 
 
+def ramp_speed(time: np.ndarray, displacement: np.ndarray) -> float:
+    """Speed that the tool has over most of its way to its peak, mm/s, however few samples that has.
+
+    The median over the way, so that holds do not count; 0 where the tool does not move, infinite
+    where it jumps.
+    """
+    way = np.abs(displacement - displacement[0])
+    stop = int(np.argmax(way)) + 1
+    gone, took = np.diff(np.maximum.accumulate(way[:stop])), np.diff(time[:stop])
+    gone, took = gone[gone > 0], took[gone > 0]
+    if not gone.size:
+        return 0.0
+    with np.errstate(divide="ignore"):
+        speed = gone / took
+    order = np.argsort(speed)
+    far = np.cumsum(gone[order])
+    return float(speed[order][np.searchsorted(far, far[-1] / 2)])
+
+
 def longest_hold(curve: Curve) -> Hold | None:
     """Of a whole record; None: it has none, or the curve is no whole record."""
     if curve.rise is None or curve.time is None:

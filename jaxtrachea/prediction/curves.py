@@ -22,8 +22,10 @@ from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.parameters import DECLARED
 from jaxtrachea.fitting.refusals import depths, unvalidated
+from jaxtrachea.fitting.relaxing import beyond_ramps, span_of
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.vectors import tilt_of
+from jaxtrachea.measurements.whole_record import ramp_speed
 from jaxtrachea.mechanics.levels.level import Motion
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Estimate, Predicted, Values, predicted
@@ -422,12 +424,11 @@ def _in_time(
     stored: FitResult, source: CurveParameters, found: CurvePrediction, time: np.ndarray
 ) -> CurvePrediction:
     """The prediction with its time, and what of that no record of the fit has."""
-    fitted = pressed(stored)
+    fitted, said = pressed(stored), [found.message]
     curves = [c for c, k in zip(fitted.curves, fitted.lane, strict=True) if k == source.lane]
-    longest = max((c.time[-1] - c.time[0] for c in curves if c.time is not None), default=np.inf)
-    message = found.message
-    if found.status.predicts and time[-1] - time[0] > longest * (1 + 1e-9):
-        message = "; ".join(
-            filter(None, [message, f"extrapolated from records of at most {longest:.3g} s"])
-        )
-    return dataclasses.replace(found, time=time, message=message)
+    if found.status.predicts:
+        if time[-1] - time[0] > (longest := span_of(curves).longest) * (1 + 1e-9):
+            said.append(f"extrapolated from records of at most {longest:.3g} s")
+        way = float(np.max(np.abs(found.displacement - found.displacement[0])))
+        said.append(beyond_ramps(curves, ramp_speed(time, found.displacement), way))
+    return dataclasses.replace(found, time=time, message="; ".join(filter(None, said)))

@@ -34,6 +34,7 @@ from jaxtrachea.scene.wall import checked_walls, contact_settings, near_patches,
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
+from jaxtrachea.trachea.sizes import check_tube
 
 #: Distance between the circles of the dent's centres: share of the tool's size; at least, on Table
 #: 1's tube, mm.
@@ -92,6 +93,7 @@ def make_scene(
     shapes = {n: jax.tree.map(lambda v: jnp.asarray(v, dtype), t.shape) for n, t in tools.items()}
     sections = not level_type(material).hangs_on_rings
     outer = _outside(geometry, material, mesh) if radius is None else jnp.asarray(radius, dtype)
+    check_tube(geometry, effects.onset_width, effects.transition)
     for shape in shapes.values():
         check_sizes(geometry, float(outer), shape)
     tube = None

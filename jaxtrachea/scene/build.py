@@ -32,7 +32,6 @@ from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.paths import named_file, path_of, read_table
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.scene.spec_parts import NEEDED, SceneTracheaSection, ShapeSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
@@ -42,6 +41,7 @@ from jaxtrachea.trachea.imported import Landmarks, read_mesh
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import Mesh, MeshError
 from jaxtrachea.trachea.section import geometry_of
+from jaxtrachea.trachea.sizes import SizeError
 from jaxtrachea.trachea.tube import make_tube
 from jaxtrachea.units import UnitError
 
@@ -53,6 +53,9 @@ KEYS = {
     "ring_positions=": "rings=",
     "geometry.length": "trachea.length",
     "geometry.radius": "trachea.radius",
+    "geometry.ring_height": "trachea.ring_height",
+    "onset_width": "model.onset_width",
+    "transition": "model.transition",
     "half_width": "model.half_width",
     "relief": "trachea.relief",
 }

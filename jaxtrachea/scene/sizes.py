@@ -1,25 +1,17 @@
-"""Sizes that a trachea and its tools can have; beyond them the unit is most likely wrong."""
+"""Sizes that tools and walls can have; beyond them the unit is most likely wrong."""
 
 import numpy as np
 
-from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape, parts_of
 from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.sizes import SizeError, cause, check_geometry
 from jaxtrachea.trachea.tube import WALL
 
-#: Length of a trachea, mm: from a newborn mouse's to more than a horse's (some 800 mm).
-LENGTHS = (2.0, 1000.0)
-#: Its radius, mm.
-RADII = (0.2, 100.0)
 #: Longest tool, mm.
 LONGEST_TOOL = 1000.0
 #: Table 1: radius of the rings' line, and of the outside, mm. What fits this tube by its length is
 #: as much longer or shorter for another one as that one is larger or smaller.
 RADIUS, OUTER = 11.3, 11.3 + WALL / 2
-
-
-class SizeError(InputError):
-    """A length that no trachea and no tool has: what, how long, what is expected, the cause."""
 
 
 def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
@@ -32,9 +24,8 @@ def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
     Raises:
         SizeError: the first of them.
     """
-    length, radius = float(geometry.length), float(geometry.radius)
-    _within("geometry.length", length, LENGTHS)
-    _within("geometry.radius", radius, RADII)
+    check_geometry(geometry)
+    radius = float(geometry.radius)
     if not radius / 2 <= outer <= 1.5 * radius:
         raise SizeError(
             f"is {outer:.4g} mm, that of the rings' line {radius:.4g} mm",
@@ -52,7 +43,7 @@ def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
                 f"is {across:.4g} mm across",
                 key="tool",
                 expected=f"at most {LONGEST_TOOL:g} mm",
-                cure=f"lengths are in mm: {_cause(across)}",
+                cure=f"lengths are in mm: {cause(across)}",
                 joint=" ",
             )
 
@@ -91,23 +82,3 @@ def _reach(part: Shape) -> float:
     corners = np.asarray(part.vertices, float)
     away = corners - corners.mean(axis=1, keepdims=True)
     return float(np.sqrt(np.sum(away**2, axis=0)).max()) + float(part.radius)
-
-
-def _within(name: str, value: float, limits: tuple[float, float]) -> None:
-    low, high = limits
-    if not low <= value <= high:
-        small = f"is the unit wrong (mm in place of m)? It would be {1000 * value:.4g} mm"
-        raise SizeError(
-            f"is {value:.4g} mm",
-            key=name,
-            expected=f"{low:g} to {high:g} mm",
-            cure=f"lengths are in mm: {_cause(value) if value > high else small}",
-            joint=" ",
-        )
-
-
-def _cause(value: float) -> str:
-    return (
-        f"is the unit wrong (m or cm in place of mm)? It would be {value / 1000:.4g} mm or "
-        f"{value / 10:.4g} mm"
-    )

@@ -13,6 +13,9 @@ STATIONS = 60
 #: How far a centreline found may run beside the middle, over the radius: 95 % of the sections away
 #: from the ends (Visible Human: 0.07 and 0.05; a tube of 92 mm bent by 90 degrees: 0.16).
 BESIDE = 0.1
+#: Share of the rays from the line that meet the wall all along it, from inside (from outside less
+#: than half); largest share of the line's length where fewer may: the wall has holes.
+ROUND, OUTSIDE = 0.45, 0.25
 #: Furthest turn of a centreline, degrees: a quarter circle, and what is found of it.
 TURN = 100.0
 #: Least spread of the surface along its axis over that across, squared: 1.5 times as long as wide.
@@ -69,8 +72,12 @@ class Shape(NamedTuple):
             rows = zip(points, frames, strict=True)
             return np.stack([contour(cells.near(p, q[:, 0]), p, q, outside) for p, q in rows])
 
+        radius = cut(vertices, faces)
+        beside = float(np.mean(np.isfinite(radius).mean(axis=1) < ROUND))
+        if beside > OUTSIDE:
+            raise _missed(f"the centreline runs outside the mesh over {100 * beside:.0f} % of it")
         hit = None if cartilage is None else np.isfinite(cut(*cartilage, outside=False))
-        return cls(line, s, cut(vertices, faces), hit)
+        return cls(line, s, radius, hit)
 
     def end_radii(self) -> tuple[float, float]:
         """Mean radius over the first and the last seventh."""
@@ -179,7 +186,18 @@ def _over(vertices, points) -> Line:
         ends.append(end + (end - inner) / np.linalg.norm(end - inner) * reach)
     line = _framed(_fine(np.concatenate([ends[:1], points, ends[1:]])))
     s = locate(line, vertices).s
+    if s.min() <= 0 or s.max() >= line.s[-1] - 1e-6:
+        raise _missed("the centreline, lengthened straight, ends before the mesh does")
     return _framed(line.at(np.linspace(s.min(), s.max(), int(np.ptp(s) / 0.5) + 2))[0])
+
+
+def _missed(found: str) -> MeshError:
+    return MeshError(
+        f"{found}; expected points inside it, from one end to the other, in the file's unit and "
+        "axes",
+        cure="give another {}",
+        arguments=("centreline=",),
+    )
 
 
 def _framed(points) -> Line:

@@ -128,9 +128,10 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     def step():
         return None if progress is None else progress(1, STEPS)
 
+    known = _checked(known)
     file = _surfaces(path, unit, part, rings, step)
     wall, cartilage, scale, notes = file
-    given = None if known.centreline is None else np.asarray(known.centreline, float) * scale
+    given = None if known.centreline is None else known.centreline * scale
     line = find_centreline(wall.vertices, wall.faces, given)
     check_turn(line)
     step()
@@ -167,6 +168,27 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
         ring_errors=cast(found.errors), ring_shares=cast(found.shares), scale=scale,
         notes=(*notes, *found.notes),
     )  # fmt: skip
+
+
+def _checked(known: Landmarks) -> Landmarks:
+    """The same with arrays of numbers; refuses what is none, and directions that are none."""
+    arrays = {}
+    for name in ("larynx", "anterior", "centreline", "ring_positions"):
+        value = getattr(known, name)
+        if value is None:
+            continue
+        try:
+            array = arrays[name] = np.asarray(value, float)
+        except (TypeError, ValueError):
+            raise MeshError(f"{name}= is {value!r}; expected numbers") from None
+        if name in ("larynx", "anterior") and not (
+            array.shape == (3,) and np.isfinite(array).all() and array.any()
+        ):
+            raise MeshError(
+                f"{name}= is {array.tolist()}, no direction; expected three finite numbers, not "
+                "all 0"
+            )
+    return dataclasses.replace(known, **arrays)
 
 
 class _File(NamedTuple):
@@ -231,8 +253,7 @@ def _axes(along, anterior):
 
 def _points_back(line: Line, larynx) -> bool:
     along = line.points[-1] - line.points[0]
-    cosine = along @ np.asarray(larynx, float)
-    cosine /= np.linalg.norm(along) * max(float(np.linalg.norm(larynx)), 1e-300)
+    cosine = along @ larynx / (np.linalg.norm(along) * np.linalg.norm(larynx))
     if abs(cosine) < 0.2:
         raise MeshError("larynx= points across the tube; expected a direction along it")
     return bool(cosine < 0)

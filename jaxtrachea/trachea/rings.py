@@ -49,9 +49,8 @@ def find_anterior(shape: Shape, given=None) -> Shape:
     relief is; opposite the flat side of the wall.
     """
     if given is not None:
-        mean = np.asarray(given, float)
-        across = np.einsum("nji,j->ni", shape.line.frames, mean).mean(axis=0)
-        if np.hypot(across[1], across[2]) < 0.2 * max(np.linalg.norm(mean), 1e-300):
+        across = np.einsum("nji,j->ni", shape.line.frames, given).mean(axis=0)
+        if np.hypot(across[1], across[2]) < 0.2 * np.linalg.norm(given):
             raise MeshError("anterior= points along the tube; expected a direction across it")
         angle = math.atan2(across[2], across[1])
     elif shape.cartilage is not None:
@@ -100,7 +99,7 @@ def find_rings(shape: Shape, positions=None, half_angle=None, holes: Sequence[Ho
         fall = max(0.01 * radius, 0.3 * float(np.ptp(inner)) if len(inner) else 0.0)
     notes = []
     if positions is not None:
-        found, source = np.asarray(positions, float), "the positions given"
+        found, source = positions, "the positions given"
         errors = shares = np.full(found.shape, np.nan)
     else:
         if own:

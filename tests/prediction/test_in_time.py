@@ -153,6 +153,15 @@ def test_a_speed_and_a_hold_on_the_command_line(fitted, monkeypatch, capsys):
     assert any(v == pytest.approx(force[-1], rel=5e-3) for v in shown)  # not that of the ramp's end
 
 
+def test_a_ramp_faster_than_all_records_is_told(read):
+    """As a hold that is too long; between the speeds of the fit nothing is said."""
+    for speed, told in ((0.7, ""), (200.0, "extrapolated from ramps of at most 2 mm/s")):
+        way = np.linspace(0, 2, 21)
+        curve = jaxtrachea.predict(read, s=40.0, displacement=way, time=way / speed)
+        assert ("extrapolated" in curve.message) == bool(told)
+        assert told in curve.message
+
+
 def test_records_of_other_speeds_are_compared_by_their_own_time(fitted, monkeypatch, capsys):
     write(fitted / "other.csv", (0.7,))
     out = fitted / "other"

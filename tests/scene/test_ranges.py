@@ -32,9 +32,9 @@ from jaxtrachea.scene.plan import ValidRange
 from jaxtrachea.scene.ranges import depth_share, lacking, outside_plan
 from jaxtrachea.scene.refusals import status_of, without_negative_values
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.sizes import SizeError
 from jaxtrachea.trachea.tube import make_tube
 
 pytestmark = [pytest.mark.long, pytest.mark.compiling]

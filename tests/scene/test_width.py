@@ -35,9 +35,9 @@ from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.sizes import SizeError
 from jaxtrachea.trachea.tube import make_tube
 from jaxtrachea.tradeoff.ladders import ladders
 from jaxtrachea.tradeoff.levels import Full, full_scene, program

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.refusals import depths, unvalidated
-from jaxtrachea.fitting.relaxing import span_of
+from jaxtrachea.fitting.relaxing import beyond_ramps, span_of
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.whole_record import loading_speed, longest_hold
 
@@ -211,17 +211,18 @@ def _paces(
 
 
 def beyond_records(study: Study, speed: float, hold: float, depth: float) -> str:
-    """Whether a press of so long is longer than the records; "" if not.
+    """Whether a press takes longer than the records, or its ramp is faster; "" if neither.
 
     Args:
         speed: mm/s.
         hold: s.
         depth: mm from first touch.
     """
-    longest = span_of([c for lane in study.curves for c in lane]).longest
-    if depth / speed + hold <= longest * (1 + 1e-9):
-        return ""
-    return f"extrapolated from records of at most {longest:.3g} s"
+    curves = [c for lane in study.curves for c in lane]
+    longest, said = span_of(curves).longest, [beyond_ramps(curves, speed, depth)]
+    if depth / speed + hold > longest * (1 + 1e-9):
+        said.insert(0, f"extrapolated from records of at most {longest:.3g} s")
+    return "; ".join(filter(None, said))
 
 
 def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:

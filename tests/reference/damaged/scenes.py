@@ -149,7 +149,7 @@ SCENES = {
         SWEEP + 'depth = "1 mm"\nphi_max = "150 deg"', "sweep.phi_max", "120", command="sweep"
     ),
     "sweep of depth -1": of(SWEEP + 'depth = "-1 mm"', "sweep.depth", "positive", command="plan"),
-    "wall of no tube": of(GOOD + '[trachea]\nradius = "0.1 mm"\nwall = "1 mm"', "trachea", "wall"),
+    "wall of no tube": of(GOOD + '[trachea]\nradius = "0.3 mm"\nwall = "1 mm"', "trachea", "wall"),
     "around 10^9": of(GOOD + "[trachea]\naround = 1000000000", "trachea.around", "2000"),
 }
 TABLES = {
