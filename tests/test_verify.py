@@ -24,6 +24,7 @@ from jaxtrachea.inference.analysis import AnalysisResults
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, compliance
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.report.tables import estimate_table, spread_table
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.rows import lane_rows, parameter_rows
@@ -104,6 +105,21 @@ def result(study):
 def test_the_specimens_are_those_of_the_case(pressed):
     assert pressed.compliance[:4, 0].min() > 0.35
     assert pressed.compliance[:4, 0].max() < 0.6
+
+
+@pytest.mark.parametrize(("iterations", "converges"), [(1, False), (3, True), (12, True)])
+def test_a_fit_that_ran_out_of_iterations_is_no_estimate(pressed, iterations, converges):
+    """Four presses that tell the truth well: it is found, or the status says that it is not."""
+    clear = specimens.Specimens(*(v[5:] for v in pressed))
+    study = make_study(curves(clear, 4, 1e-4, np.random.default_rng(4)))
+    tolerances = Tolerances(iterations=iterations)
+    result = fit(study, Settings(starts=2, more_starts=0, tolerances=tolerances))
+    if converges:
+        assert result.status == [FitStatus.CONVERGED]
+        np.testing.assert_allclose(result.value, clear.truth, rtol=0.02)
+    else:
+        assert result.status == [FitStatus.MAX_ITERATIONS]
+        assert assess(result, 0, 0).verdict == "failed"
 
 
 @pytest.mark.slow

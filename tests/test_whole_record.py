@@ -1,6 +1,7 @@
 """Records as they went: which samples, what is told of speeds and holds, what is refused."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -24,12 +25,14 @@ WAY = np.array([-1.0, -1.0, 3.0, 3.0, 0.0, 0.0, 2.0, 2.0])
 GAMMA, TAU, STIFF = 0.9, 1.0, 0.3
 
 
-def force_of(time, depth):
+def linear(depth):
+    return STIFF * np.maximum(depth, 0)
+
+
+def force_of(time, depth, elastic=linear):
     """A spring beside one branch, step by step, each exact for a straight way."""
     held, before, out = 0.0, 0.0, []
-    for dt, e in zip(
-        np.diff(time, prepend=time[0] - 1e-9), STIFF * np.maximum(depth, 0), strict=True
-    ):
+    for dt, e in zip(np.diff(time, prepend=time[0] - 1e-9), elastic(depth), strict=True):
         x = dt / TAU
         held = np.exp(-x) * held - GAMMA * np.expm1(-x) / x * (e - before)
         before = e
@@ -76,7 +79,7 @@ def test_blocks_keep_corners_and_means():
     curve = finish(raw, dataclasses.replace(WHOLE, samples=400))
     assert 300 < len(curve.force) <= 420
     found = segment(raw.displacement, raw.force, raw.time, first=True)
-    edges = block_edges(found, 3000, 400)
+    edges = block_edges(found, raw.displacement, raw.time, 400)
     starts = [part.start for part in found.parts]
     assert np.isin(starts, edges).all()
     count = np.diff(np.append(edges, 3000))
@@ -84,11 +87,62 @@ def test_blocks_keep_corners_and_means():
         assert averaged(values, edges) @ count / 3000 == pytest.approx(values.mean(), rel=1e-12)
     np.testing.assert_allclose(averaged_noise(raw.sigma, edges), 0.1 / np.sqrt(count), rtol=1e-12)
     np.testing.assert_allclose(curve.sigma, 0.1 / np.sqrt(count), rtol=1e-12)
-    # Where the hold begins blocks are single samples, and grow.
+    # Where the hold begins blocks are single samples, and grow; it ends in single ones.
     hold = next(part for part in found.parts if part.kind == "hold")
     of_hold = count[(edges >= hold.start) & (edges < hold.stop)]
     assert (of_hold[:5] == 1).all()
-    assert of_hold[-2] > 20
+    assert of_hold.max() > 20
+    assert (of_hold[-2:] == 1).all()
+
+
+def spaced(step):
+    """Times with every corner; `step`: those of a hold since it began, of its duration."""
+    parts = [
+        a + (step(b - a) if up == down else np.linspace(0, b - a, 200, endpoint=False))
+        for (a, b), (up, down) in zip(
+            itertools.pairwise(CORNERS), itertools.pairwise(WAY), strict=True
+        )
+    ]
+    return np.concatenate([*parts, CORNERS[-1:]])
+
+
+def fast_then_slow(duration):
+    """A sample every 2 ms for half a second, then every 0.2 s."""
+    return np.append(np.arange(0, min(duration, 0.5), 0.002), np.arange(0.5, duration, 0.2))
+
+
+TIMES = {
+    "even": np.arange(0.0, 29.0, 0.01),
+    "logarithm of time": spaced(lambda d: np.append(0, np.geomspace(2e-3, d, 300)[:-1])),
+    "few, logarithm": spaced(lambda d: np.append(0, np.geomspace(2e-3, d, 60)[:-1])),
+    "two rates": spaced(fast_then_slow),
+    "jitter": np.sort(np.arange(0.0, 29.0, 0.01) + np.random.default_rng(3).uniform(0, 8e-3, 2900)),
+}
+
+
+@pytest.mark.parametrize("samples", [40, 100, 400])
+@pytest.mark.parametrize("time", TIMES.values(), ids=TIMES)
+def test_mean_forces_lie_on_the_curve_through_mean_samples(time, samples):
+    """Whatever the times of samples are: the force from block to block is the mean force.
+
+    Truth is the force at the times of all samples, from steps of 1 ms.
+    """
+    corners = WAY.copy()
+    corners[4] = 1.0  # unloads in contact, so that the second press is upon what is left
+    corners[5] = 1.0
+
+    def elastic(depth):
+        return STIFF * np.maximum(depth, 0) + 0.03 * np.maximum(depth, 0) ** 3
+
+    fine = np.union1d(np.arange(0.0, 29.0, 1e-3), time)
+    force = force_of(fine, np.interp(fine, CORNERS, corners), elastic)[np.isin(fine, time)]
+    depth = np.interp(time, CORNERS, corners)
+    raw = record(displacement=depth, force=force, time=time, rows=np.arange(time.size), sigma=None)
+    curve = finish(raw, dataclasses.replace(WHOLE, samples=samples))
+    assert len(curve.force) < time.size
+    steps = force_of(curve.time, curve.displacement, elastic)
+    # 0.1 % of the peak: a hundredth of what a branch gives.
+    np.testing.assert_allclose(curve.force, steps, rtol=0, atol=1e-3 * force.max())
 
 
 def test_markers_are_averaged_and_gaps_stay():

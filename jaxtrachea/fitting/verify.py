@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.lane import data_weight
 from jaxtrachea.fitting.minima import Minima
 from jaxtrachea.fitting.needs_review import APART, natural_sizes
@@ -33,6 +34,9 @@ FAR = 16.0
 ACCURACY, ROUNDS = 3e-3, 20
 #: Fall of the statistic below the estimate's from which a point is a better minimum.
 BETTER = 1e-2
+#: Fall of the statistic, at most, that a Gauss-Newton step still promises a fit that has crawled
+#: along a valley: what one unknown gains by noise alone. In tries such fits had 0.15 at most.
+GAIN = 1.0
 
 
 class Evidence(NamedTuple):
@@ -66,7 +70,8 @@ class _Region:
     def add(self, lane, theta, cost) -> Bool[np.ndarray, " n"]:
         """Take in points (n, P) that lie within; whether each does for any unknown.
 
-        One that lies clearly below the estimate is remembered as the better minimum.
+        One that lies clearly below the estimate is remembered as the better minimum; of a fit that
+        has not converged, one that lies below it at all.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             rise = 2 * (cost - self.cost[lane])[:, None] / self.dispersion[lane]
@@ -77,7 +82,7 @@ class _Region:
             self.low[k][lower], self.high[k][upper] = theta[n][lower], theta[n][upper]
             self.at_low[k][lower], self.at_high[k][upper] = theta[n], theta[n]
             fall = self.cost[k] - cost[n]
-            least = 0.5 * BETTER * np.nanmin(self.dispersion[k])
+            least = 0.5 * BETTER * np.nanmin(self.dispersion[k]) * self.result.succeeded[k]
             if fall > max(least, self.floor[k]) and cost[n] < self.lowest[k]:
                 self.lowest[k], self.better[k] = cost[n], theta[n]
         return within.any(axis=1)
@@ -123,9 +128,31 @@ def verify_minimum(
             return evidence, region.better
     region.sides = _sides(result, settings, doubts, alive)
     _profiled(region, evidence)
-    settled = (result.status > FitStatus.UNIDENTIFIABLE) & doubts.any(axis=1)
-    evidence.status[settled] = FitStatus.UNIDENTIFIABLE
+    _settle(result, evidence, np.flatnonzero(~result.succeeded & doubts.any(axis=1)))
     return evidence, region.better
+
+
+def _settle(result: FitResult, evidence: Evidence, lanes: Int[np.ndarray, " n"]) -> None:
+    """Statuses of lanes that have not converged, but have next to nothing to gain.
+
+    They crawl along a valley, whose profile is open, or rounding hides the last steps. A fit that
+    ran out of iterations elsewhere has open profiles, too: its residuals are large.
+    """
+    if not len(lanes):
+        return
+    info = informations(result.study, lanes, result.theta[lanes], result.whitened_sigma[lanes])
+    moves = (result.study.lanes.active[lanes] > 0) & ~result.at_bound[lanes]
+    gradient = np.where(moves, info.gradient, 0)
+    size = np.sqrt(np.maximum(np.diagonal(info.bread, axis1=1, axis2=2), np.finfo(float).tiny))
+    scaled = info.bread / size[:, :, None] / size[:, None] * (moves[:, :, None] & moves[:, None])
+    slope = gradient / size
+    gain = np.einsum("ni,nij,nj->n", slope, np.linalg.pinv(scaled, hermitian=True), slope)
+    opened = (evidence.evidence_end[lanes] == ProfileEnd.OPEN).any(axis=(1, 2))
+    limit = np.where(opened, GAIN, BETTER) * np.nanmin(result.uncertainty.dispersion[lanes], axis=1)
+    held = result.at_bound[lanes].any(axis=1)
+    solved = np.where(held, FitStatus.AT_BOUND, FitStatus.CONVERGED)
+    status = np.where(opened, FitStatus.UNIDENTIFIABLE, solved)
+    evidence.status[lanes] = np.where(gain <= limit, status, evidence.status[lanes])
 
 
 def _sides(result: FitResult, settings: Settings, doubts, progress) -> Sides:

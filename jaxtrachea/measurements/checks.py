@@ -117,7 +117,8 @@ def _as_it_went(curve: Curve, found: Segments, samples: int | None) -> Curve:
     start, stop = rise_of(found, size)
     if samples is None or size <= samples:
         return dataclasses.replace(curve, rise=(start, stop))
-    edges = block_edges(found, size, samples)
+    assert curve.time is not None
+    edges = block_edges(found, curve.displacement, curve.time, samples)
     arrays = ("displacement", "force", "time", *(q.name for q in OBSERVED if q.gaps))
     changed = {n: averaged(v, edges) for n in arrays if (v := getattr(curve, n)) is not None}
     if curve.sigma is not None:

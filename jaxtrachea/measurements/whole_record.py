@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from jaxtrachea.measurements.curve import Curve, Fault
-from jaxtrachea.measurements.holds import FEWEST, Hold
+from jaxtrachea.measurements.holds import FEWEST, SLOWER, Hold
+from jaxtrachea.measurements.parts import Segment
 from jaxtrachea.measurements.segments import Segments, segment
 from jaxtrachea.measurements.usage import RELAXED
 
@@ -26,8 +27,12 @@ FIRST_FORCE = 0.05
 STILL = 0.01
 #: Standard deviations of a trend before first touch that noise does not have.
 TREND = 5.0
-#: Blocks of a part of the record at least.
-LEAST_BLOCKS = 4
+#: Blocks of a part of the record at least, and of a ramp: in 40 the mean force of one lies within
+#: 0.1 % of the peak on the curve.
+LEAST_BLOCKS, LEAST_OF_RAMP = 4, 40
+#: Times since the tool stopped at the end and the beginning of a block, at most: the mean of a
+#: force that decays lies within 0.05 % of what decays on the curve, at its mean time.
+LONGEST = 1.15
 
 
 def check_clock(time: Float64[np.ndarray, " n"] | None) -> None:
@@ -186,28 +191,81 @@ def loading_speed(curve: Curve) -> float:
     return 0.0 if rise.time is None else speed_of(rise.time, rise.displacement)
 
 
-def block_edges(found: Segments, size: int, most: int) -> Int[np.ndarray, " b"]:
+def block_edges(
+    found: Segments,
+    displacement: Float64[np.ndarray, " n"],
+    time: Float64[np.ndarray, " n"],
+    most: int,
+) -> Int[np.ndarray, " b"]:
     """First samples of blocks that a record is averaged in, about `most` in all.
 
-    As many in each part of the record: even in ramps, whose ends stay as they are, and shorter at
-    the beginning of a hold, where the force changes quickly.
+    As many in each part of the record: of one duration in ramps, whose ends stay as they are, and
+    in holds in proportion to the time since the tool stopped. There are more than `most` where
+    the mean force of a block would lie off the curve (`LEAST_OF_RAMP`, `LONGEST`).
     """
-    parts = [(p.kind, p.start, min(p.stop, size)) for p in found.parts if p.start < size]
+    parts = list(_ramps_and_holds(found, displacement, time))
     share = max(most // len(parts), LEAST_BLOCKS)
-    short = sum(max(share - (stop - start), 0) for _, start, stop in parts)
-    longer = sum(stop - start > share for _, start, stop in parts)
+    short = sum(max(share - (part.stop - part.start), 0) for part in parts)
+    longer = sum(part.stop - part.start > share for part in parts)
     share += short // max(longer, 1)
     edges = []
-    for kind, start, stop in parts:
-        n = stop - start
-        if n <= share:
+    for part in parts:
+        since = time[part.start : part.stop] - time[max(part.start - 1, 0)]
+        n, last = len(since), since[-1]
+        if n <= share or not last > since[0]:
             own = np.arange(n)
-        elif kind == "hold" or (kind == "rest" and start > 0):
-            own = np.unique(np.round(np.geomspace(1, n, share)).astype(int)) - 1
+        elif part.kind == "hold":
+            first = since[since > 0][0]
+            least = np.ceil(np.log(last / first) / np.log(LONGEST)) + 1
+            at = np.geomspace(first, last, max(share, int(least)))
+            if part.stop < time.size:  # where within its last samples the tool goes on
+                halves = np.arange(1, np.log2(last / first) + 1)
+                at = np.append(at, last - (last - since[0]) / 2**halves)
+            own = np.interp(at, since, np.arange(n))
         else:
-            own = np.concatenate([[0], np.round(np.linspace(1, n - 1, share - 1)).astype(int)])
-        edges.append(start + own[own < n])
+            blocks = share if part.kind == "rest" else max(share, LEAST_OF_RAMP)
+            own = np.interp(np.linspace(since[1], last, blocks - 1), since, np.arange(n))
+        edges.append(part.start + np.append(0, np.round(own).astype(int)))
     return np.unique(np.concatenate(edges))
+
+
+def _ramps_and_holds(
+    found: Segments, displacement: np.ndarray, time: np.ndarray
+) -> Iterator[Segment]:
+    """Parts of the record, cut where the tool stops or goes on within them.
+
+    A "rest" is the one that the record begins with; all others are holds.
+    """
+    for part in found.parts:
+        at, stop = part.start, min(part.stop, displacement.size)
+        if part.kind == "rest" and at > 0:
+            yield Segment("hold", at, stop)
+            continue
+        holds = [(max(hold.start, at), min(hold.stop, stop)) for hold in found.steps]
+        if part.kind in ("load", "unload"):
+            holds += _still_ends(at, stop, displacement, time, found.tolerance)
+        for start, end in sorted(holds):
+            if at <= start < end:
+                yield from (Segment(part.kind, at, start),) if at < start else ()
+                yield Segment("hold", start, end)
+                at = end
+        if at < stop:
+            yield Segment(part.kind, at, stop)
+
+
+def _still_ends(
+    start: int, stop: int, displacement: np.ndarray, time: np.ndarray, tolerance: float
+) -> Iterator[tuple[int, int]]:
+    """Samples at the beginning and the end of a leg where the tool stands still."""
+    way, clock = displacement[start:stop], time[start:stop]
+    share = SLOWER * tolerance / max(abs(way[-1] - way[0]), tolerance)
+    if share < 1:
+        leaves = int(np.argmax(np.abs(way - way[0]) > tolerance))
+        arrives = way.size - int(np.argmax(np.abs(way - way[-1])[::-1] > tolerance))
+        if clock[leaves] - clock[0] > share * (clock[-1] - clock[0]):
+            yield start, start + leaves
+        if clock[-1] - clock[arrives - 1] > share * (clock[-1] - clock[0]):
+            yield start + arrives, stop
 
 
 def averaged(
