@@ -141,9 +141,9 @@ def with_doubts(result: FitResult, doubts: Doubts) -> FitResult:
     """A fit that knows the intervals of lanes with air (`FitResult.with_air`)."""
     with_air = result.with_air.copy()
     for lane, found in doubts.items():
-        for i, (p, *of) in enumerate(result.study.unknowns[lane]):
+        for i, (p, name, trial) in enumerate(result.study.unknowns[lane]):
             none = (p.value, p.value) if p.auto else (np.nan, np.nan)
-            with_air[lane, i] = found.get((p.name, *of), none)
+            with_air[lane, i] = found.get((p.name, name, trial), none)
     return dataclasses.replace(result, with_air=with_air) if doubts else result
 
 

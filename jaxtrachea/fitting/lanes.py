@@ -257,7 +257,8 @@ def lanes_of(
         curves=every,
         lanes=len(groups),
     )
-    whole = _blank(layout) | {"precision": _precision(layout, groups)}
+    whole = _blank(layout)
+    whole["precision"] = _precision(layout, groups)
     for k, (curves, names) in enumerate(zip(groups, unknowns, strict=True)):
         _fill({n: v if v is None else v[k] for n, v in whole.items()}, layout, curves, names)
     return Lane(others=_others(layout, groups, whole["precision"]), **whole)
