@@ -107,6 +107,8 @@ def test_the_specimens_are_those_of_the_case(pressed):
     assert pressed.compliance[:4, 0].max() < 0.6
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("iterations", "converges"), [(1, False), (3, True), (12, True)])
 def test_a_fit_that_ran_out_of_iterations_is_no_estimate(pressed, iterations, converges):
     """Four presses that tell the truth well: it is found, or the status says that it is not."""

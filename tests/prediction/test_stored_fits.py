@@ -105,9 +105,9 @@ def unfinished(folder):
 @pytest.mark.parametrize(
     ("harm", "says"),
     [
-        (old, "schema version 4 does not keep .* fit again with this version"),
+        (old, "schema version 5 does not keep .* fit again with this version"),
         (cut, "damaged"),
-        (newer, "schema version is 6, this program reads 5"),
+        (newer, "schema version is 7, this program reads 6"),
         (other, "expected 'jaxtrachea-results'"),
         (without_model, "no dataset 'description'"),
         (not_json, "damaged or not written by this program"),
