@@ -52,7 +52,7 @@ def test_everything_comes_back_from_the_file(study, read):
 def old(folder):
     """Of a version that kept less."""
     with h5py.File(folder / "results.h5", "r+") as file:
-        file.attrs["schema_version"] = 4
+        file.attrs["schema_version"] = VERSION - 1
         del file["study"]
 
 
@@ -63,7 +63,7 @@ def cut(folder):
 
 def newer(folder):
     with h5py.File(folder / "results.h5", "r+") as file:
-        file.attrs["schema_version"] = 6
+        file.attrs["schema_version"] = VERSION + 1
 
 
 def other(folder):
@@ -105,9 +105,9 @@ def unfinished(folder):
 @pytest.mark.parametrize(
     ("harm", "says"),
     [
-        (old, "schema version 5 does not keep .* fit again with this version"),
+        (old, f"schema version {VERSION - 1} does not keep .* fit again with this version"),
         (cut, "damaged"),
-        (newer, "schema version is 7, this program reads 6"),
+        (newer, f"schema version is {VERSION + 1}, this program reads {VERSION}"),
         (other, "expected 'jaxtrachea-results'"),
         (without_model, "no dataset 'description'"),
         (not_json, "damaged or not written by this program"),
