@@ -75,11 +75,7 @@ def estimate(
     tube = jax.tree.map(jnp.asarray, model.geometry if geometry is None else geometry)
     data = (lane, sigma, tube)
     state = _solve(model, tolerances, *jax.lax.stop_gradient((start, data)))
-    held = active_set(state.theta, state.point.gradient, lane)
-    opened = jnp.any(_left_open(state.point.hessian, ~held) != 0)
-    lost = opened & (state.status == FitStatus.CONVERGED)
-    status = jnp.where(lost, jnp.int8(FitStatus.UNIDENTIFIABLE), state.status)
-    return Estimate(_implicit(model, state.theta, data), status)
+    return Estimate(_implicit(model, state.theta, data), _status(state, lane))
 
 
 def gradient(
@@ -150,6 +146,16 @@ def _implicit_jvp(model: FitModel, primals, tangents):
     return theta, jnp.linalg.solve(matrix + opened, rhs - opened @ rhs)
 
 
+@jax.jit
+def _status(state: State, lane: Lane) -> Int[Array, ""]:
+    """That of the solver, or UNIDENTIFIABLE."""
+    held = active_set(state.theta, state.point.gradient, lane)
+    opened = jnp.any(_left_open(state.point.hessian, ~held) != 0)
+    lost = opened & (state.status == FitStatus.CONVERGED)
+    return jnp.where(lost, jnp.int8(FitStatus.UNIDENTIFIABLE), state.status)
+
+
+@jax.jit
 def _left_open(H: Float[Array, "P P"], free) -> Float[Array, "P P"]:
     """Projection onto combinations of what is free that the curvature does not tell from a plane.
 
