@@ -59,6 +59,7 @@ def missed(found, D, C, mu):
     return balance, cone, closed, -found.dissipated.min(), -F[..., 0].min()
 
 
+@pytest.mark.long
 def test_two_tools_stick_together_and_one_slides():
     """Held fast both are springs in series with the skeleton; the one without friction slides."""
     _, C, *_ = drawn(2)

@@ -319,6 +319,21 @@ def test_lengths_of_the_model_in_another_unit_are_refused(options, says):
         study_of(spec, Measurements((signed(np.copy, np.copy),), (), ()))
 
 
+def test_tools_and_walls_in_another_unit_are_refused():
+    curves = [signed(np.copy, np.copy)]
+    with pytest.raises(SizeError, match=r"^tool_radius is 3000 mm; .* It would be 3 mm"):
+        build_study(curves, table_1(), Options(), tool_radius=3000.0)
+    sections = {"skeleton": "sections", "contact": "bonded"}
+    for more, says in (
+        ({"data": {"files": "x", "tool_radius": "3 m"}}, "data.tool_radius is 3000 mm"),
+        ({"model": sections, "wall": {"h": "2.6 m"}}, "wall.h is 2600 mm; expected 0.005 to 50 mm"),
+        ({"model": sections, "wall": {"h_M": "2 um"}}, "wall.h_M is 0.002 mm"),
+    ):
+        spec = FitSpec.model_validate({"data": {"files": "x"}, **more})
+        with pytest.raises(SpecError, match=f"^{says}.* is the unit wrong"):
+            study_of(spec, Measurements(tuple(curves), (), ()))
+
+
 def test_a_tube_in_metres_is_refused_in_python():
     tube = Geometry.create(0.16, [0.05, 0.1], radius=0.0113, ring_height=0.004)
     with pytest.raises(SizeError, match=r"^geometry.length is 0.16 mm; .* It would be 160 mm"):

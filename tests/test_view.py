@@ -31,6 +31,9 @@ from jaxtrachea.viewer.play import PlayError, of_file
 from jaxtrachea.viewer.scene import for_a_mouse, read_handled
 from jaxtrachea.viewer.values import Slider, with_values
 
+#: Each waits for the page, which compiles for a quarter of a minute.
+pytestmark = pytest.mark.long
+
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 SCENE = """title = "a <short> tube"
 [trachea]
@@ -161,7 +164,6 @@ def test_the_label_is_that_of_simulate(browser):
     assert [place(browser, at)[0] for at in PLACES[:2]] == LABELS[:2]
 
 
-@pytest.mark.long
 def test_the_labels_here_are_those_of_simulate(simulation):
     with h5py.File(simulation) as file:
         force, status = file["series"]["force"][()], file["series"]["status"][()]
@@ -361,7 +363,6 @@ def test_a_recording_plays_from_disk(browser, recording):
     assert not [a for a in browser.requests if not a.startswith(("file:", "data:", "blob:"))]
 
 
-@pytest.mark.long
 def test_a_recording_of_another_version_is_refused(simulation, tmp_path, monkeypatch, capsys):
     file = Path(shutil.copy(simulation, tmp_path))
     with h5py.File(file, "r+") as changed:
@@ -413,7 +414,6 @@ def test_each_scene_is_refused_before_the_page_or_can_be_moved(path, monkeypatch
     assert spec.path[-1].duration == (1000.0 if relaxes else None)
 
 
-@pytest.mark.long
 def test_a_force_that_relaxes_falls_while_the_hand_rests(tmp_path):
     """From the jump to the long run; a twelfth of the force lasts beyond it in 0.2 s, none in 2."""
     scene = tmp_path / "relaxing.toml"
@@ -460,7 +460,6 @@ def wait_until(true, seconds):
 
 
 @needs_browser
-@pytest.mark.long
 def test_several_tools_are_seen_and_moved(tmp_path):
     """One by one by a drag and by keys; the force of each is that of `simulate` at these poses."""
     named = SCENE.replace("[tool]\n", '[[tool]]\nname = "left"\n').replace(
@@ -554,7 +553,6 @@ def test_what_cannot_be_read_is_said(tmp_path):
     assert "none.toml" in live.state.text
 
 
-@pytest.mark.long
 def test_one_tool_of_a_list_is_the_only_one(scene_file):
     named = SCENE.replace("[tool]", '[[tool]]\nname = "ball"\nfriction = 0.3').replace(
         "[[path]]", '[[path]]\ntool = "ball"'

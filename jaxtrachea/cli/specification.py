@@ -93,6 +93,8 @@ def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:
         raise SpecError.like(error, key=f"wall.{error.key}") from None
     try:
         return defaults_of(options, geometry_of(spec.trachea), wall, spec.data.tool_radius)
+    except SizeError as error:
+        raise SpecError.like(error, key=f"data.{error.key}") from None
     except InputError as error:
         raise SpecError.like(error) from None
 
@@ -277,7 +279,8 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
     except SpecError:
         raise
     except SizeError as error:
-        raise SpecError.like(error, key=f"model.{error.key}") from None
+        section = "data" if error.key == "tool_radius" else "model"
+        raise SpecError.like(error, key=f"{section}.{error.key}") from None
     except ValueError as error:
         raise SpecError(str(error)) from None
 

@@ -15,6 +15,7 @@ import jaxtrachea
 from jaxtrachea.files.atomic import write_text
 
 
+@functools.cache
 def installed(package: str) -> str:
     """Version of a package, in words where there is none."""
     try:

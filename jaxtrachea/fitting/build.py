@@ -47,7 +47,7 @@ from jaxtrachea.measurements.record_zeros import Zeros
 from jaxtrachea.mechanics.levels.choose import level_of
 from jaxtrachea.mechanics.levels.options import Options
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.sizes import check_tube
+from jaxtrachea.trachea.sizes import TOOLS, check_length, check_tube
 
 #: Depth over the radius of the tube beyond which the noise of forces is looked for a share.
 DEEP = 0.1
@@ -91,7 +91,7 @@ def build_study(
             if there is but one specimen.
 
     Raises:
-        SizeError: a length of tube or options that is most likely in another unit.
+        SizeError: a length of tube, tool or options that is most likely in another unit.
         ValueError: a `tool_radius` that is no length, none where `weighting` leaves pressed ends
             out, no curve, one that cannot be pressed (`refusals`), with specimen and trial named;
             a parameter that the model does not have; a `force_slope` that is free, and a curve
@@ -99,6 +99,8 @@ def build_study(
     """
     if tool_radius is not None and not 0 <= tool_radius < np.inf:
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
+    if tool_radius:
+        check_length("tool_radius", tool_radius, TOOLS)
     if not weighting.pressed_ends and tool_radius is None:
         raise ValueError("pressed_ends=False needs tool_radius: which rings are under the tool")
     check_tube(geometry, options.onset_width, options.transition)

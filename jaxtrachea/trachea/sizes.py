@@ -9,6 +9,10 @@ LENGTHS = (2.0, 1000.0)
 RADII = (0.2, 100.0)
 #: Extent of a ring along it, mm: from a tenth of a newborn mouse's to ten times a horse's.
 HEIGHTS = (0.02, 100.0)
+#: Thickness of its wall, mm: from a tenth of a mouse's to some five times a horse's.
+THICKNESSES = (0.005, 50.0)
+#: Radius of a tool's flat end, mm: from a needle's.
+TOOLS = (0.01, 100.0)
 #: Widest smooth first touch, over the radius: wider ones are a good part of a press.
 ONSET = 0.1
 

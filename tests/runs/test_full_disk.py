@@ -51,6 +51,7 @@ def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys):
         assert sorted(tree(out)) == sorted(tree(peace / "out"))
 
 
+@pytest.mark.long
 def test_a_folder_that_became_read_only(peace, study, monkeypatch, capsys):
     """Resumed and rerun where nothing can be written: said with what is kept, nothing changed."""
     begun(peace, study, monkeypatch, capsys)

@@ -105,6 +105,7 @@ def test_force_and_moment_are_what_changes_the_stored_energy():
     assert np.abs(along).max() > 0.005  # there is something to find
 
 
+@pytest.mark.long
 def test_the_moment_is_the_work_of_small_turns(monkeypatch):
     """Of an energy that is linear in the matrix of the pose, by differences over 1e-5 rad."""
     rng, rows, h = np.random.default_rng(5), 3, 1e-5

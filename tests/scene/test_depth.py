@@ -235,6 +235,7 @@ def test_softer_than_the_specimen_softens_sooner():
     assert make_scene(TUBE, SOFT, down([0.1]), effects=BARE).plan.level("skeleton") == "linear"
 
 
+@pytest.mark.long
 def test_ways_of_a_path_over_the_radius():
     """Of a tool that holds its place, and of one that wanders; of presses in any direction."""
     facts = facts_of(make_scene(TUBE, SOFT, down([3.0, -1.0]), effects=BARE), SOFT, down([3.0, -1]))

@@ -214,7 +214,8 @@ def test_the_place_of_first_touch_does_not_follow_the_step():
         assert off < share * np.linalg.norm(known)
 
 
-@pytest.mark.parametrize("mu", [None, pytest.param(0.5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("mu", [None, 0.5])
 def test_what_is_clear_of_a_round_wall_does_not_press(mu):
     """The tangent plane at the place of first touch lies above a round wall beside it.
 

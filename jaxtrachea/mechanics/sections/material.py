@@ -18,6 +18,7 @@ from jaxtrachea._arguments import real, shaped
 from jaxtrachea._errors import InputError
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import VALUES, Declaration, Fitted
+from jaxtrachea.trachea.sizes import THICKNESSES, TOOLS, check_length
 
 
 def _field(name: str, unit: str, dimension: str, description: str, fit: Fitted, **more: Any) -> Any:
@@ -214,13 +215,15 @@ class Wall:
     bed_t: float = 0.002
 
     def __post_init__(self):
-        """Refuse a wall that cannot be (`InputError`)."""
+        """Refuse a wall that cannot be, or is most likely in another unit (`InputError`)."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name != "nu" and not (np.isfinite(value) and value > 0):
                 raise InputError(f"is {value}", key=field.name, expected="more than 0", joint=" ")
         if not 0 <= self.nu < 0.5:
             raise InputError(f"is {self.nu}", key="nu", expected="in [0, 0.5)", joint=" ")
+        for name in ("h", "h_M"):
+            check_length(name, getattr(self, name), THICKNESSES)
         if self.h_C > self.h:
             expected = f"at most the thickness of the wall, {self.h} mm"
             raise InputError(f"is {self.h_C} mm", key="h_C", expected=expected, joint=" ")
@@ -291,7 +294,11 @@ def from_wall(
     Returns:
         The stiffnesses; `extrapolated` where the tube is unlike the specimen (`proportions`), or
         the tool has a width: `Factors` were found with a point.
+
+    Raises:
+        SizeError: a `tool_radius` that is most likely in another unit.
     """
+    check_length("tool_radius", tool_radius, TOOLS)
     pitches = ring_pitches(geometry)
     plane = 1 - wall.nu**2
     (ring, neutral), ligament = _composite(wall), wall.E_L * wall.h**3 / 12
