@@ -8,6 +8,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.analyses.misfit import MISFIT
+from jaxtrachea.inference.residuals import glitches
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
@@ -110,3 +111,23 @@ def test_estimated_noise_is_not_compared():
     assert np.isnan(found.ratio).all()
     assert MISFIT.section(result) == []
     assert list(MISFIT.sentences(result)) == []
+
+
+def test_glitches_are_those_put_in():
+    """Single samples; no stretch that is missed, no wide noise, and nothing under a robust loss."""
+    force, put = lines(3), [(0, 0, 7), (0, 0, 40), (2, 0, 21)]
+    for k, (lane, _, sample) in enumerate(put):
+        force[lane, sample] += (30 + 10 * k) * SIGMA
+    result = compared(force, None)
+    found = glitches(result)
+    assert sorted(glitch[:3] for glitch in found) == put
+    assert found[0][:3] == put[2]  # the largest
+    sentence = MISFIT.section(result)[0]
+    assert sentence.startswith("3 force samples stand alone in 2 of 3 fits")
+    assert f"+{50 * SIGMA:.2g} N off, of s2 t at {D[21]:.3g} mm" in sentence
+    assert MISFIT.section(compared(force, None, loss="huber")) == []
+    stretch = lines(3)
+    stretch[:, 20:25] += 40 * SIGMA
+    assert glitches(compared(stretch, None)) == []
+    wide = 2 * D + SIGMA * np.random.default_rng(4).standard_t(5, size=(3, len(D)))
+    assert glitches(compared(wide, None)) == []

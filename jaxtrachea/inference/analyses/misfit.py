@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
+from jaxtrachea.inference.residuals import GLITCH, glitches
 
 
 def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> FitResult:
@@ -41,9 +42,26 @@ def _share(result: FitResult) -> list[str]:
     ]
 
 
+def _glitches(result: FitResult) -> list[str]:
+    """That samples stand alone, where all samples count alike."""
+    found = glitches(result) if result.study.model.loss == "linear" else []
+    if not found:
+        return []
+    lanes, first = len({glitch.lane for glitch in found}), found[0]
+    curve = result.study.curves[first.lane][first.trial]
+    samples = "1 force sample stands" if len(found) == 1 else f"{len(found)} force samples stand"
+    where = f" in {lanes} of {result.lanes} fits" if result.lanes > 1 else ""
+    return [
+        f"{samples} alone{where}, more than {GLITCH:g} times the noise from the model while both "
+        f"neighbours are near it. The largest is {-first.residual:+.2g} N off, of {curve.specimen} "
+        f"{curve.trial} at {curve.displacement[first.sample]:.3g} mm. If these are glitches of the "
+        'load cell, `fit.loss = "huber"` counts them less.'
+    ]
+
+
 def _sentences(result: FitResult) -> list[str]:
-    """The share of the force in the noise; residuals larger than the noise given, and smaller."""
-    compared, every, said = result.misfit, result.lanes, _share(result)
+    """The share of the force in the noise; glitches; residuals beyond the noise given, or below."""
+    compared, every, said = result.misfit, result.lanes, _share(result) + _glitches(result)
     for k, (kind, key) in enumerate((("Force", "noise.force"), ("Marker", "noise.joints"))):
         ratio, flagged = compared.ratio[:, k], compared.flagged[:, k]
         for beyond, cause in (
