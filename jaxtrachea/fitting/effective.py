@@ -14,7 +14,8 @@ independent noise often has by chance is taken for none.
 r is that of the residuals. The fit has made it smaller than that of the noise, by about
 (1 + 4 r) / n and more with many unknowns. An error of the model is correlated as well: the interval
 then says what noise of that size and slowness would do. Where less than one independent sample is
-left over the unknowns, nothing is said at all (`Effective.misses`).
+left over the unknowns, nothing is said at all (`Effective.misses`). Errors of coarse rounding are
+alike from curve to curve, where none is alike along one: see `rounding`.
 """
 
 from typing import NamedTuple
@@ -25,6 +26,7 @@ from jaxtyping import Bool, Float, Int
 from jaxtrachea.fitting.information import fixed_count, unknown_count
 from jaxtrachea.fitting.misfit import Residuals, misfit
 from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.rounding import GROWTH, rounding
 
 #: Correlation of neighbouring residuals from which reports speak of it.
 CORRELATED = 0.3
@@ -49,6 +51,8 @@ class Effective(NamedTuple):
         quantile: half of a 95 % interval in standard errors (Student's t); inf likewise; (lanes,).
         growth: of the length of 95 % intervals against those of independent residuals; inf
             likewise; (lanes,).
+        rounding: step of forces that are rounded more coarsely than their noise, N, for which
+            `factor` has grown; NaN where they are not; (lanes,).
         misses: less than one independent sample is left over the unknowns: the model misses the
             curve; (lanes,).
     """
@@ -59,6 +63,7 @@ class Effective(NamedTuple):
     factor: Float[np.ndarray, " lanes"]
     quantile: Float[np.ndarray, " lanes"]
     growth: Float[np.ndarray, " lanes"]
+    rounding: Float[np.ndarray, " lanes"]
     misses: Bool[np.ndarray, " lanes"]
 
 
@@ -153,9 +158,11 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
     # Residuals too few for a correlation are taken for independent.
     few = np.isnan(worth)
     factor, quantile = np.where(few, excess, factor), np.where(few, plain, quantile)
+    steps = rounding(np.asarray(lanes.force), of.seen["force"])
+    factor = np.where(np.isnan(steps), factor, GROWTH * factor)
     factor, quantile = (np.where(misses, np.inf, v) for v in (factor, quantile))
     with np.errstate(invalid="ignore", divide="ignore"):
         growth = np.where(misses, np.inf, np.maximum(factor * quantile / plain, 1))
         share = worth / n
     seen = lag_correlation(of.seen["force"])
-    return Effective(seen, worth, share, factor, quantile, growth, misses)
+    return Effective(seen, worth, share, factor, quantile, growth, steps, misses)

@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtrachea.fitting.assessment import assess
 from jaxtrachea.fitting.effective import CORRELATED
+from jaxtrachea.fitting.rounding import GROWTH
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
 from jaxtrachea.inference.labels import determined_unknowns, lane_label
 from jaxtrachea.inference.residuals import where_missed
@@ -62,6 +63,13 @@ def _sentences(found: AnalysisResults) -> Iterator[str]:
                 f"intervals are {np.median(wide.growth[lanes]):.2g} times as long for it"
             )
         yield said
+    lanes = np.flatnonzero(result.succeeded & np.isfinite(wide.rounding))
+    if len(lanes):
+        yield (
+            f"Forces are rounded to {np.median(wide.rounding[lanes]):.2g} N in {len(lanes)} of "
+            f"{every} fits, more coarsely than their noise: curves repeat each other's errors, and "
+            f"intervals are {GROWTH:g} times as long for it. Record, or export, more digits"
+        )
     missed = [k for k in worst_first(result) if wide.misses[k] and result.succeeded[k]]
     if missed and result.study.free:
         named = "; ".join(f"{lane_label(result, k)}: {where_missed(result, k)}"
