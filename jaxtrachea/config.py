@@ -200,6 +200,15 @@ class EvenRings(Section):
     last: PositiveLength
     """position of the last"""
 
+    @model_validator(mode="after")
+    def _apart(self) -> "EvenRings":
+        if self.count == 1 and self.first != self.last:
+            raise ValueError(
+                f"1 ring cannot stand at {self.first:g} and at {self.last:g} mm; expected the same "
+                "first and last, or a count of 2 or more"
+            )
+        return self
+
 
 Rings = Annotated[
     Annotated[EvenRings, Tag(EVEN)] | Annotated[list[PositiveLength], Tag(LISTED)],

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import Progress
 
-from jaxtrachea.cli.scene import _print_rows
+from jaxtrachea.cli.scene import _print_misses, _print_rows
 from jaxtrachea.cli.terminal import Stages, progress_bar
 from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
@@ -45,7 +45,7 @@ from jaxtrachea.report.fit import report_text
 from jaxtrachea.report.overview import overview
 from jaxtrachea.report.plots import STYLE, draw_all
 from jaxtrachea.results.rows import lane_rows, parameter_rows, summary_rows
-from jaxtrachea.status import FitStatus
+from jaxtrachea.status import FitStatus, PressStatus
 from jaxtrachea.trachea.geometry import table_1
 
 NAMES = ["$a$", "a_b$", r"$\frac{$", "=1+1", "<script>", "a|b", "two\nlines", "x" * 200, "🫁",
@@ -479,3 +479,18 @@ def test_rows_of_a_simulation_on_the_terminal(capsys, monkeypatch):
         assert shown is None or numbered == 2 * shown
         assert ["1", "80", "0", "-0.265", "0.0741", "-0.191", "0", "ok", "24", "%"] in lines
         assert ["1", "1.14", "-2.37", "0"] in lines
+
+
+def test_a_tool_that_is_nowhere_near_is_told(capsys):
+    clear, touching = PressStatus.NO_CONTACT, PressStatus.OK
+    for status, gap, said in (
+        (
+            [clear, clear],
+            np.array([237.2, 234.0]),
+            "no row touches the wall: the tool stays 234 mm",
+        ),
+        ([clear, touching], np.array([1.0, -0.2]), ""),
+        ([clear, clear], None, ""),
+    ):
+        _print_misses(SimpleNamespace(status=np.array(status), gap=gap))
+        assert capsys.readouterr().out.startswith(said)

@@ -111,6 +111,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 lost |= drawing.result()
         say_lost(lost)
     _print_rows(out, staged.scene.names)
+    _print_misses(out)
     failed = _print_failures(out.status, "row(s)")
     say(*staged.notes)
     if choice is not None:
@@ -369,6 +370,16 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
     inputs = {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in staged.files}
     dtype = str(jax.tree.leaves(staged.material)[0].dtype)
     return provenance(scene, inputs, dtype, ("read", "compute"), clock)
+
+
+def _print_misses(out) -> None:
+    """That the tool comes nowhere near the wall, where it touches it in no row."""
+    import numpy as np
+
+    from jaxtrachea.status import PressStatus
+
+    if out.gap is not None and np.all(np.asarray(out.status) == PressStatus.NO_CONTACT):
+        say(f"no row touches the wall: the tool stays {float(np.min(out.gap)):.3g} mm away or more")
 
 
 def _print_failures(status, what: str) -> int:

@@ -226,10 +226,14 @@ def _corners(body: Surface, name: str) -> tuple[np.ndarray, float]:
         return kept, 0.0
     few = _foremost(kept, MAX_CORNERS)
     left_out = max(float(_outside(kept, _planes(few)).max()), 0.0)
-    if left_out > COARSEST * float(np.ptp(points, axis=0).max()):
+    most = COARSEST * float(np.ptp(points, axis=0).max())
+    if left_out > most:
         raise MeshError(
-            f"{name} has {len(kept)} corners; of {MAX_CORNERS} some stand out by {left_out:.2g} mm",
-            cure="simplify the surface, or replace round edges by rounding = '1 mm'",
+            f"{name} has {len(kept)} corners, a part at most {MAX_CORNERS}, and of so many some "
+            f"stand out by {left_out:.2g} mm; expected {most:.2g} mm or less, "
+            f"{100 * COARSEST:g} % of its size",
+            cure="simplify the surface, give a round tool as a shape, or give what is left of it "
+            "within its round edges, say 1 mm, with rounding = '1 mm'",
         )
     return few, left_out
 

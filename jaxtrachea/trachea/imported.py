@@ -48,7 +48,8 @@ class Imported(eqx.Module):
 
     Attributes:
         mesh: the surface in the tube frame.
-        geometry: length along the centreline, rings, mean outer radius over the rings' arc.
+        geometry: length along the centreline, rings; as radius the mean distance of the surface
+            from the centreline over the rings' arc, which is not that of the ring line.
         rotation: rows are the axes of the tube frame in the file.
         origin: of the tube frame in the file, in the file's unit.
         scale: mm per unit of the file. File position = origin + rotation^T position / scale.
@@ -142,7 +143,12 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     shape = find_anterior(shape, known.anterior)
     holes = holes_of(wall, shape.line)
     if holes:
-        notes += (f"{len(holes)} holes in the wall, the largest {holes[0].words}",)
+        many = (
+            "1 hole in the wall,"
+            if len(holes) == 1
+            else f"{len(holes)} holes in the wall, the largest"
+        )
+        notes += (f"{many} {holes[0].words}",)
     if cartilage is not None:
         holes = holes_of(join_corners(cartilage)[0], shape.line)
     found = find_rings(shape, known.ring_positions, known.half_angle, holes)
@@ -162,7 +168,10 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
         )  # fmt: skip
     except InputError as error:
         name = "half_angle" if error.key == "half_angle" else "ring_positions"
-        raise MeshError.like(error, cure="give {}", arguments=(name,)) from error
+        given = getattr(known, name) is not None
+        source = "" if given else "; it was found from the arc with relief, which noise may widen"
+        cure = f"give {{}}{source if name == 'half_angle' else ''}"
+        raise MeshError.like(error, cure=cure, arguments=(name,)) from error
     return Imported(
         mesh=mesh, geometry=geometry, rotation=cast(rotation), origin=cast(origin / scale),
         ring_errors=cast(found.errors), ring_shares=cast(found.shares), scale=scale,
