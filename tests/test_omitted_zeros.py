@@ -160,7 +160,8 @@ def test_the_promise_is_the_fall_of_the_sum_of_squares(mixed):
     J = columns.unknowns[0].reshape(3, -1)
     c, r = columns.zeros[0, 1].ravel(), columns.residual[0].ravel()
     left = c - J.T @ np.linalg.solve(J @ J.T, J @ c)
-    fall, value = omitted_zeros._promise(np.array([[c @ left]]), np.array([left @ r]), [])
+    gram = np.array([[c @ left]])
+    fall, value = omitted_zeros._promise(gram, np.array([left @ r]), gram, [])
     A = np.column_stack([*J, c])
     _, without, *_ = np.linalg.lstsq(A[:, :3], -r)
     step, within, *_ = np.linalg.lstsq(A, -r)
@@ -261,3 +262,26 @@ def test_the_command_says_what_a_relaxing_record_hides(tmp_path, monkeypatch, ca
     for name, truth in {"onset": 0.3, **TRUTH}.items():
         assert abs(float(found[name]["value"]) - truth) < 3.5 * float(found[name]["se"])
     assert read_results(out).study.unknowns[0][-1][0].name in ("onset", "force_offset")
+
+
+def test_short_curves_beside_long_ones_ask_by_chance_alone():
+    """Each curve weighs the same, and one of 12 samples is as noisy as one of 400: a third asked.
+
+    With three standard errors on each side a zero is asked for in 0.3 %.
+    """
+    rng, lengths = np.random.default_rng(8), (12, 40, 400)
+    curves = []
+    for i in range(60):
+        for n in lengths:
+            D = np.linspace(0, WAY, n)
+            F = 0.3 * D + 0.02 * D**3 + 0.01 * rng.normal(size=n)
+            curves.append(Curve(f"T{i:02d}", str(n), 75.0, 0.0, D, F))
+    study = build_study(curves, table_1(), TOTAL)
+    assert not study.takes_zeros.any()
+    every = np.arange(60)
+    plain = fit(study.take(every), Settings(starts=1, verify=False))
+    found = omitted_zeros.asked_for(plain, every)
+    assert len(found.names) <= 3
+    columns, able = columns_of(plain, every), omitted_zeros.able_zeros(plain)
+    asks = [bool(omitted_zeros._chosen(plain, columns, n, able[n])) for n in every.tolist()]
+    assert omitted_zeros._may_ask(plain, columns, able)[asks].all()

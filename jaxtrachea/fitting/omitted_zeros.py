@@ -7,11 +7,13 @@ multiplier) test asks whether the cost has a slope along a zero that is fixed (R
 doi:10.1017/S0305004100023987; Breusch and Pagan 1980, doi:10.2307/2297111): with the derivative c
 of the whitened residuals r by the zero, and M c what the Jacobian's columns leave of it,
 
-    z^2 = (c^T M r)^2 / (c^T M c) / s^2
+    z^2 = (c^T M r)^2 / (c^T M B^2 M c) / s^2
 
-is the fall of the sum of squares, in variances of the noise, that the zero promises. s^2, and the
-independent samples that z^2 counts by (`effective`), are those of the residuals that would be left.
-Where these are still correlated, the model misses the curve and a zero is not what it lacks.
+is the fall of the sum of squares, in variances of the noise, that the zero promises. B are the
+weights of the curves: the residuals of a short curve that weighs as much as long ones are so much
+larger than the noise. s^2, and the independent samples that z^2 counts by (`effective`), are those
+of the residuals that would be left, without B. Where these are still correlated, the model misses
+the curve and a zero is not what it lacks.
 """
 
 import dataclasses
@@ -71,12 +73,14 @@ class _Columns(NamedTuple):
         residual: (n, T, m).
         unknowns: derivative by each unknown, 0 where it is not free; (n, P, T, m).
         zeros: by each of `ZEROS` of each trial, mm and N; (n, Z, T, m).
+        balance: weight of each trial, which is in all of these; (n, T).
     """
 
     lanes: Int[np.ndarray, " n"]
     residual: Float[np.ndarray, "n T m"]
     unknowns: Float[np.ndarray, "n P T m"]
     zeros: Float[np.ndarray, "n Z T m"]
+    balance: Float[np.ndarray, "n T"]
 
 
 def asked_for(result: FitResult, among: Int[np.ndarray, " n"]) -> Asked:
@@ -146,7 +150,8 @@ def _fitting(result: FitResult, columns: _Columns, chosen: list[Chosen]) -> list
             if not np.isfinite(X).all() or not np.isfinite(r).all():
                 continue
             step = -np.linalg.lstsq((X / size[:, None]).T, r, rcond=1e-10)[0] / size
-            _, correlation = _unit(result, int(lanes[n]), r + step @ X, len(places))
+            remaining = (r + step @ X) / _of_entries(columns, n)
+            _, correlation = _unit(result, int(lanes[n]), remaining, len(places))
             good[n] = correlation <= CORRELATED
             theta[n] += step[: len(J)]
             for (z, t), v in zip(places, step[len(J) :], strict=True):
@@ -164,6 +169,11 @@ def _rows(columns: _Columns, n: int, places) -> tuple[np.ndarray, np.ndarray]:
     for k, (z, t) in enumerate(places):
         C[k, t] = columns.zeros[n, z, t]
     return J, C.reshape(len(places), J.shape[1])
+
+
+def _of_entries(columns: _Columns, n: int) -> Float[np.ndarray, " m"]:
+    """Weight of its curve, of every entry of the residual of lane n."""
+    return np.repeat(columns.balance[n], columns.residual.shape[2])
 
 
 def able_zeros(result: FitResult) -> Bool[np.ndarray, "lanes Z T"]:
@@ -223,7 +233,9 @@ def _columns(result: FitResult, lanes: Int[np.ndarray, " n"], theta, study: Stud
     N = D.shape[2]
     by_offset[..., :N] = study.lanes.precision * weight[..., :N]
     zeros = np.stack([by_onset, by_offset], axis=1)
-    return _Columns(lanes, base * weight, unknowns, zeros)
+    balance = np.asarray(study.lanes.balance, float)
+    balance = np.where(balance > 0, balance, 1.0)
+    return _Columns(lanes, base * weight, unknowns, zeros, balance)
 
 
 def _weights(result: FitResult, lanes: Int[np.ndarray, " n"], value) -> np.ndarray:
@@ -245,20 +257,31 @@ def _may_ask(result: FitResult, columns: _Columns, able) -> Bool[np.ndarray, " n
     All at once: of most lanes that says no, as `_chosen` would.
     """
     r, J, C = columns.residual, columns.unknowns, columns.zeros
-    inner = np.linalg.pinv(
-        np.einsum("nptm,nqtm->npq", J, J, optimize=True), rcond=1e-14, hermitian=True
-    )
-    of_zeros = np.einsum("nztm,nptm->nztp", C, J, optimize=True) @ inner[:, None]
-    slope = np.einsum("nztm,ntm->nzt", C, r)
-    slope -= np.einsum("nztp,np->nzt", of_zeros, np.einsum("nptm,ntm->np", J, r))
-    size = np.einsum("nztm,nztm->nzt", C, C)
-    own = size - np.einsum("nztp,nptm,nztm->nzt", of_zeros, J, C, optimize=True)
-    fall = slope**2 / np.where(own > 0.5 * _ALIKE * size, own, np.inf)
+    JJ = np.einsum("nptm,nqtm->ntpq", J, J, optimize=True)
+    Jr, JC = np.einsum("nptm,ntm->ntp", J, r), np.einsum("nztm,nptm->nztp", C, J, optimize=True)
+    Cr, size = np.einsum("nztm,ntm->nzt", C, r), np.einsum("nztm,nztm->nzt", C, C)
+    share = JC @ np.linalg.pinv(JJ.sum(axis=1), rcond=1e-14, hermitian=True)[:, None]
+
+    def left(power: int):
+        """Products of what the unknowns leave of a zero, with the residual and with itself.
+
+        Trials count by a power of their weight; (n, Z, T) each.
+        """
+        a = columns.balance**power
+        with_residual = a[:, None] * Cr - np.einsum("nztp,nsp,ns->nzt", share, Jr, a)
+        both = np.einsum("nztp,npq,nztq->nzt", share, np.einsum("nt,ntpq->npq", a, JJ), share)
+        return with_residual, a[:, None] * (size - 2 * np.sum(share * JC, axis=3)) + both
+
+    (slope, own), (_, spread), (along, unweighted) = left(0), left(2), left(-2)
+    usable = own > 0.5 * _ALIKE * size
+    fall = slope**2 / np.where(usable, spread, np.inf)
+    value = -slope / np.where(usable, own, np.inf)
     lanes = columns.lanes.tolist()
-    left = np.array([_left(result, lane, 1) for lane in lanes])
+    beyond = np.array([_left(result, lane, 1) for lane in lanes])
     asked = np.array([_asked(result, lane, 1) for lane in lanes])
-    square = np.einsum("ntm,ntm->n", r, r)
-    unit = (square[:, None, None] - fall) / np.maximum(left, 1)[:, None, None]
+    square = np.einsum("ntm,nt->n", r**2, columns.balance**-2)[:, None, None]
+    square = square + value * (2 * along + value * unweighted)
+    unit = square / np.maximum(beyond, 1)[:, None, None]
     known = result.study.noise_known[lanes][:, None, None]
     unit = np.where(known, np.maximum(unit, 1), unit)
     enough = fall > (1 - _ROUNDING) * asked[:, None, None] * unit
@@ -277,18 +300,20 @@ def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
     J, C = _rows(columns, n, places)
     left = C - (C @ J.T) @ np.linalg.pinv(J @ J.T, rcond=1e-14, hermitian=True) @ J
     gram, slope = C @ left.T, left @ r
+    weight = _of_entries(columns, n)
+    spread = (left * weight**2) @ left.T
     size = np.sum(C * C, axis=1)
     usable = np.diag(gram) > _ALIKE * size
     chosen: list[int] = []
     while usable.any():
-        fall, value = _promise(gram, slope, chosen)
+        fall, value = _promise(gram, slope, spread, chosen)
         possible = usable & _possible(result, lane, places, value)
         if not possible.any():
             break
         best = int(np.argmax(np.where(possible, fall, -np.inf)))
         now = [*chosen, best]
         step = np.linalg.solve(gram[np.ix_(now, now)], slope[now])
-        unit, _ = _unit(result, lane, r - step @ left[now], len(now))
+        unit, _ = _unit(result, lane, (r - step @ left[now]) / weight, len(now))
         if not fall[best] > _asked(result, lane, len(now)) * unit:
             break
         twins = [
@@ -303,16 +328,23 @@ def _chosen(result: FitResult, columns: _Columns, n: int, able) -> Chosen:
     return {places[k]: float(v) for k, v in zip(chosen, value, strict=True)}
 
 
-def _promise(gram, slope, chosen: list[int]):
-    """Fall of the sum of squares by each zero beside the chosen ones, and its value."""
-    if chosen:
-        inner = np.linalg.pinv(gram[np.ix_(chosen, chosen)], hermitian=True)
-        slope = slope - gram[:, chosen] @ (inner @ slope[chosen])
-        own = np.diag(gram) - np.einsum("ki,ij,kj->k", gram[:, chosen], inner, gram[:, chosen])
-    else:
-        own = np.diag(gram)
-    own = np.where(own > _ALIKE * np.diag(gram), own, np.inf)
-    return slope**2 / own, -slope / own
+def _promise(gram, slope, spread, chosen: list[int]):
+    """Fall of the sum of squares by each zero beside the chosen ones, and its value.
+
+    Args:
+        gram: products of what the unknowns leave of the zeros; (K, K).
+        slope: and of these with the residual; (K,).
+        spread: as `gram`, each entry times the square of the weight of its curve; (K, K).
+        chosen: numbers of those that are taken.
+    """
+    share = gram[:, chosen] @ np.linalg.pinv(gram[np.ix_(chosen, chosen)], hermitian=True)
+    slope = slope - share @ slope[chosen]
+    own = np.diag(gram) - np.sum(share * gram[:, chosen], axis=1)
+    beside = spread[:, chosen]
+    noise = np.diag(spread) - 2 * np.sum(share * beside, axis=1)
+    noise = noise + np.sum((share @ beside[chosen]) * share, axis=1)
+    usable = own > _ALIKE * np.diag(gram)
+    return slope**2 / np.where(usable, noise, np.inf), -slope / np.where(usable, own, np.inf)
 
 
 def _possible(result: FitResult, lane: int, places, value) -> Bool[np.ndarray, " K"]:
