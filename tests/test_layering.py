@@ -118,7 +118,7 @@ WITHIN = {
         {"information", "predictions", "shared", "structure"},
         {"covariance", "noise", "stream"},
         {"criteria", "misfit", "settings", "verdict"},
-        {"rounding"},
+        {"rounding", "glitches"},
         {"effective", "few_samples", "branch_times"},
         {"assessment"},
         {"result"},

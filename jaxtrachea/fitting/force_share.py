@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxtrachea.fitting.glitches import glitches
 from jaxtrachea.fitting.lane import forces, with_observed
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.parameters import Parameter
@@ -129,6 +130,9 @@ def next_levels(
     zero = offsets(study, result.theta)[lanes, :, None]
     force = np.asarray(study.lanes.force)[lanes] - zero
     force = np.where(np.isfinite(residual), force + residual, force)
+    # Glitches are no noise that grows: a few large ones at large forces look like a share.
+    measured, precision = (np.asarray(v)[lanes] for v in (study.lanes.force, study.lanes.precision))
+    noise = np.where(glitches(residual, measured, precision), np.nan, residual)
     plain = (study.lanes.precision if study.shares is None else study.shares.plain)[lanes]
     rows = range(len(lanes))
     groups = [list(rows)] if study.joint else [[k] for k in rows]
@@ -136,7 +140,7 @@ def next_levels(
     for group in groups:
         group = [k for k in group if result.succeeded[lanes[k]]]
         r, F, p = (np.concatenate([v[k].ravel() for k in group] or [np.zeros(0)])
-                   for v in (residual, force, plain))  # fmt: skip
+                   for v in (noise, force, plain))  # fmt: skip
         seen = np.isfinite(r) & (p > 0)
         if not seen.any():
             continue

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtrachea.fitting.glitches import glitches
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult
 
@@ -61,15 +62,8 @@ def where_missed(result: FitResult, lane: int) -> str:
     )
 
 
-#: A glitch is as many times the noise, and as large a share of the lane's peak. Lanes whose largest
-#: residual is less than `SEARCHED` times the mean have none.
-GLITCH, OF_PEAK, SEARCHED = 8.0, 1e-3, 5.0
-#: Share of the residuals that are taken for noise, and the normal quantile of it.
-_QUIET, _NORMAL = 0.9, 1.645
-
-
 class Glitch(NamedTuple):
-    """A force sample that stands alone: its lane, trial and number, and its residual, N."""
+    """A force sample that stands alone (`fitting.glitches`): where, and its residual, N."""
 
     lane: int
     trial: int
@@ -77,31 +71,10 @@ class Glitch(NamedTuple):
     residual: float
 
 
-def glitches(result: FitResult) -> list[Glitch]:
-    """Force samples far from the model while both neighbours are near it; the largest first.
-
-    Far is `GLITCH` times the noise, which is taken from the residuals of the lane and from what
-    they differ from the mean of their neighbours (90 % quantiles: up to a tenth may be glitches).
-    Where a model misses a stretch, neighbours are missed alike. Ends of a record have no neighbour
-    on one side, and are not looked at.
-    """
-    found = []
-    for lane in np.flatnonzero(result.succeeded).tolist():
-        residual = result.residuals["force"][lane]
-        size = np.abs(residual[np.isfinite(residual)])
-        if not size.size or not size.max() > SEARCHED * size.mean():
-            continue
-        z = residual * np.asarray(result.study.lanes.precision[lane])
-        alone = np.zeros_like(z)
-        alone[:, 1:-1] = z[:, 1:-1] - (z[:, :-2] + z[:, 2:]) / 2
-        alone = np.where(np.isfinite(alone), alone, 0.0)
-        known = np.isfinite(z)
-        noise = np.quantile(np.abs(z[known]), _QUIET) / _NORMAL
-        differs = np.quantile(np.abs(alone[known]), _QUIET) / _NORMAL
-        height = np.abs(alone)
-        least = (height > GLITCH * max(noise, differs)) & (np.abs(z) > GLITCH * noise)
-        least[:, 1:-1] &= height[:, 1:-1] > np.maximum(height[:, :-2], height[:, 2:])
-        peak = np.max(np.abs(result.study.lanes.force[lane]))
-        least &= np.abs(residual) > OF_PEAK * peak
-        found += [Glitch(lane, t, i, float(residual[t, i])) for t, i in np.argwhere(least).tolist()]
-    return sorted(found, key=lambda glitch: -abs(glitch.residual))
+def glitches_of(result: FitResult) -> list[Glitch]:
+    """Glitches of the lanes that have an estimate, the largest first."""
+    residual, lanes = result.residuals["force"], result.study.lanes
+    found = glitches(residual, np.asarray(lanes.force), np.asarray(lanes.precision))
+    places = np.argwhere(found & result.succeeded[:, None, None]).tolist()
+    each = [Glitch(*place, float(residual[tuple(place)])) for place in places]
+    return sorted(each, key=lambda glitch: -abs(glitch.residual))

@@ -4,9 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxtrachea.fitting.glitches import GLITCH
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Analysis, AnalysisResults, Cells, Progress, Request
-from jaxtrachea.inference.residuals import GLITCH, glitches
+from jaxtrachea.inference.residuals import glitches_of
 
 
 def _compute(request: Request, findings: AnalysisResults, progress: Progress) -> FitResult:
@@ -44,7 +45,7 @@ def _share(result: FitResult) -> list[str]:
 
 def _glitches(result: FitResult) -> list[str]:
     """That samples stand alone, where all samples count alike."""
-    found = glitches(result) if result.study.model.loss == "linear" else []
+    found = glitches_of(result) if result.study.model.loss == "linear" else []
     if not found:
         return []
     lanes, first = len({glitch.lane for glitch in found}), found[0]
