@@ -76,5 +76,5 @@ def glitches_of(result: FitResult) -> list[Glitch]:
     residual, lanes = result.residuals["force"], result.study.lanes
     found = glitches(residual, np.asarray(lanes.force), np.asarray(lanes.precision))
     places = np.argwhere(found & result.succeeded[:, None, None]).tolist()
-    each = [Glitch(*place, float(residual[tuple(place)])) for place in places]
+    each = [Glitch(k, t, i, float(residual[k, t, i])) for k, t, i in places]
     return sorted(each, key=lambda glitch: -abs(glitch.residual))
