@@ -260,6 +260,7 @@ def test_neighbours_lift_the_wall_off_a_third():
     np.testing.assert_allclose(balance, 0, atol=1e-14)
 
 
+@pytest.mark.long
 def test_a_glued_tool_beside_others():
     """Linear laws: those that touch and the glued one, which pulls, are springs in series."""
     values, glued = VALUES | {"k_3": 0.0, "k_5": 0.0}, np.array([False, False, True, False])

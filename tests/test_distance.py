@@ -370,6 +370,7 @@ def place(v):
 cold_lanes = quick(jax.vmap(lambda v: signed_distance(A, B, place(v))))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PLACES)
 def test_witness_points(name):
     """On both smoothed boundaries, `distance` apart along the normal."""

@@ -141,6 +141,7 @@ def test_dataset_takes_profiles_as_the_table_does():
     assert profiles.lower[0] < bound
 
 
+@pytest.mark.long
 def test_noise_of_markers_that_are_not_there_is_no_number(result):
     assert np.isnan(result.to_dataset().sigma.sel(kind="joints")).all()
 

@@ -127,6 +127,7 @@ def test_where_they_do_not_serve(study, changes, more, monkeypatch):
     assert not serves(study_of(every), Settings(), 4 * LANES)
 
 
+@pytest.mark.long
 def test_nor_for_a_fitted_onset():
     every = curves()[1]
     table = synthetic.parameters(onset={"value": 0.0})

@@ -123,6 +123,7 @@ def test_against_frame(s, phi, more):
         np.testing.assert_allclose(F, (0.3 + 0.02 * np.sum(d * d)) * d, atol=1e-13)
 
 
+@pytest.mark.long
 def test_axial_share_is_equal_along_each_side():
     """Paper fig. 7a: P^x the same at every joint of a side, F_A : F_B = L_BC : L_AC (eq. 2)."""
     got = pressed()
