@@ -68,3 +68,19 @@ def test_intervals_grow_and_it_is_told():
     for name, truth in {"k_1": 2.0, "k_3": 0.4}.items():
         i = [unknown.name for unknown in result.study.free].index(name)
         assert result.lower[0, i] < truth < result.upper[0, i]
+
+
+@pytest.mark.long
+def test_lanes_of_a_joint_fit_grow_together():
+    """What they share has one interval, though one of them is rounded."""
+    force = 2.0 * D + 0.4 * D**3
+    curves = [
+        Curve("a", "t", 75.0, 0.0, D, 0.2 * np.round(force / 0.2)),
+        Curve("b", "t", 75.0, 0.0, D, force + 0.05 * RNG.normal(size=len(D))),
+    ]
+    changes = {"k_1": {"scope": "shared"}}
+    total = Options(coupling="total", onset_width=0.0)
+    study = build_study(curves, table_1(), total, changes, joint=True)
+    found = fit(study, Settings(starts=1, verify=False)).effective
+    assert found.rounding == pytest.approx([0.2, 0.2])
+    assert found.factor[0] == found.factor[1] > 1.5

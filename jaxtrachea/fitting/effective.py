@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxtrachea._memory import in_blocks
 from jaxtrachea.fitting.information import fixed_count, unknown_count
 from jaxtrachea.fitting.misfit import Residuals, misfit
 from jaxtrachea.fitting.predictions import Prediction
@@ -32,8 +33,6 @@ from jaxtrachea.fitting.rounding import GROWTH, rounding
 CORRELATED = 0.3
 #: Pairs of neighbours from which a correlation is taken.
 MIN_PAIRS = 10
-#: Lanes looked at together.
-TOGETHER = 256
 #: Times 1 / sqrt(pairs): correlation that independent noise exceeds in 5 % of all records.
 CHANCE = 1.645
 #: Independent samples that must be left over the unknowns for an interval.
@@ -73,8 +72,7 @@ def lag_correlation(residual: Float[np.ndarray, "lanes trials samples"]) -> np.n
     About 0 for independent noise, near 1 where the model misses the shape of the curves; NaN with
     fewer than `MIN_PAIRS` pairs. Not centred: a residual of one sign is correlated, too.
     """
-    blocks = range(0, max(len(residual), 1), TOGETHER)
-    return np.concatenate([_lag_correlation(residual[k : k + TOGETHER]) for k in blocks])
+    return in_blocks(_lag_correlation, residual)
 
 
 def _lag_correlation(residual: Float[np.ndarray, "lanes trials samples"]) -> np.ndarray:
@@ -159,6 +157,8 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
     few = np.isnan(worth)
     factor, quantile = np.where(few, excess, factor), np.where(few, plain, quantile)
     steps = rounding(np.asarray(lanes.force), of.seen["force"])
+    if study.joint and np.isfinite(steps[alive]).any():  # one interval of what lanes share
+        steps = np.full(len(n), np.nanmedian(steps[alive]))
     factor = np.where(np.isnan(steps), factor, GROWTH * factor)
     factor, quantile = (np.where(misses, np.inf, v) for v in (factor, quantile))
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -130,21 +130,22 @@ def next_levels(
     zero = offsets(study, result.theta)[lanes, :, None]
     force = np.asarray(study.lanes.force)[lanes] - zero
     force = np.where(np.isfinite(residual), force + residual, force)
-    # Glitches are no noise that grows: a few large ones at large forces look like a share.
-    measured, precision = (np.asarray(v)[lanes] for v in (study.lanes.force, study.lanes.precision))
-    noise = np.where(glitches(residual, measured, precision), np.nan, residual)
     plain = (study.lanes.precision if study.shares is None else study.shares.plain)[lanes]
     rows = range(len(lanes))
     groups = [list(rows)] if study.joint else [[k] for k in rows]
     sigma, share = np.ones(len(lanes)), np.zeros(len(lanes))
     for group in groups:
         group = [k for k in group if result.succeeded[lanes[k]]]
-        r, F, p = (np.concatenate([v[k].ravel() for k in group] or [np.zeros(0)])
-                   for v in (noise, force, plain))  # fmt: skip
-        seen = np.isfinite(r) & (p > 0)
+        of = lanes[group]
+        measured, precision = (
+            np.asarray(v)[of] for v in (study.lanes.force, study.lanes.precision)
+        )
+        # Glitches are no noise that grows: a few large ones at large forces look like a share.
+        left_out = glitches(residual[group], measured, precision).ravel()
+        r, F, p = (v[group].ravel() for v in (residual, force, plain))
+        seen = np.isfinite(r) & (p > 0) & ~left_out
         if not seen.any():
             continue
-        of = lanes[group]
         left = 1 - np.sum(study.lanes.active[of]) / max(np.sum(result.samples[of]), 1)
         r, F, p = r[seen] / np.sqrt(max(left, 0.05)), np.abs(F[seen]), p[seen]
         wanted = study.force_share

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxtrachea._memory import in_blocks
+
 #: A glitch is as many times the noise, and as large a share of the lane's peak. Lanes whose largest
 #: residual is less than `SEARCHED` times the mean have none.
 GLITCH, OF_PEAK, SEARCHED = 8.0, 1e-3, 5.0
@@ -28,6 +30,10 @@ def glitches(
         force: measured, N.
         precision: what residuals are compared by, 1 / N or in any unit.
     """
+    return in_blocks(_glitches, residual, force, precision)
+
+
+def _glitches(residual, force, precision) -> np.ndarray:
     found = np.zeros(residual.shape, bool)
     known = np.isfinite(residual)
     size = np.where(known, np.abs(residual), 0.0)

@@ -8,6 +8,8 @@ the same forces: most of all near first touch, where the local law is read.
 import numpy as np
 from jaxtyping import Float
 
+from jaxtrachea._memory import in_blocks
+
 #: Root mean square of the residuals over the step, if they are those of rounding: 0.289 without
 #: noise, more with it. Less is no rounding: an even row of forces without noise has steps, too.
 OF_STEP = (0.2, 0.345)
@@ -15,8 +17,6 @@ OF_STEP = (0.2, 0.345)
 GROWTH = 1.6
 #: Samples of a curve at least; how near to whole numbers its differences over the step are.
 FEWEST, NEAR = 10, 0.02
-#: Lanes looked at together.
-TOGETHER = 256
 
 
 def rounding(
@@ -28,10 +28,7 @@ def rounding(
         force: measured, N.
         residual: model minus data, N; NaN where nothing was measured.
     """
-    blocks = range(0, max(len(force), 1), TOGETHER)
-    return np.concatenate(
-        [_rounding(force[k : k + TOGETHER], residual[k : k + TOGETHER]) for k in blocks]
-    )
+    return in_blocks(_rounding, force, residual)
 
 
 def _rounding(force, residual) -> np.ndarray:
